@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from importlib import import_module
 from pathlib import Path
 
@@ -301,3 +302,18 @@ def test_the_caption_of_a_prediction_says_how_far_its_distance_is_off(tmp_path):
     assert "distance off by 25%" in captions and "distance off by 50%" in captions
     assert error_caption(true, np.full(true.shape, np.inf)) == "nothing within 10 m"
     assert error_caption(np.full(true.shape, np.inf), true) == "predicted far away"
+
+
+def test_what_is_above_start_and_goal_is_cut_off_and_a_map_is_a_slice(roofed: Scene) -> None:
+    oblique, above = make_cutaway(roofed, OBLIQUE), make_cutaway(roofed, MAP)
+    assert oblique.note == "cut off above 4.0 m" and above.note == "cut off above 4.0 m, and below 1.5 m"
+    for world in (oblique, above):
+        assert max(solid.corners[:, 2].max() for solid in world.shown) <= 4.0
+        assert all(np.all(np.isfinite(solid.outward)) for solid in world.shown)
+    middle = np.array([[10.0, 5.0, 2.5], [2.2, 5.0, 1.6]])
+    assert list(is_occluded(middle, oblique.shown, MAP)) == [False, True]
+    floor = middle * [1, 1, 0] + [0, 0, 0.2]
+    assert list(is_occluded(floor, oblique.shown, MAP)) == [True, True]
+    assert list(is_occluded(floor, above.shown, MAP)) == [False, True]
+    outside = dataclasses.replace(roofed, start=np.array([1.0, 5.0, 2.5]), goal=np.array([19.0, 5.0, 3.0]))
+    assert make_cutaway(outside, MAP).note == ""

@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import io
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +25,7 @@ from edqn_jax.report.page.evaluated import EvaluatedRun, folders_of, names_of
 from edqn_jax.report.page.pictures import LEVELS, picture_strip
 from edqn_jax.report.page.worlds import world_data
 from edqn_jax.sim.scene.mjcf import load_scene
+from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.task.flights import Closest, Flights, Record
 from edqn_jax.sim.task.outcomes import Outcome
 
@@ -94,6 +96,21 @@ def test_a_ceiling_and_an_outer_wall_say_which_side_they_close(tmp_path: Path) -
     file.write_text(ROOM)
     closes = [shape.get("closes") for shape in world_data(load_scene(file))["shapes"]]
     assert sorted(filter(None, closes)) == [[1, 1], [2, 1]] and len(closes) == 5
+
+
+def test_a_mesh_is_shown_itself_and_says_that_it_hides_flights(roofed: Scene) -> None:
+    shape = world_data(roofed)["shapes"][0]
+    assert shape["kind"] == "mesh" and shape["hides"] and "closes" not in shape
+    placed = np.reshape(shape["vertices"], (-1, 3)) @ np.reshape(shape["turn"], (3, 3)).T + shape["at"]
+    np.testing.assert_allclose([placed.min(0), placed.max(0)], [[2, 1, 0.5], [18, 9, 5.5]], atol=2e-3)
+    assert np.shape(shape["triangles"]) == (24, 3)
+
+
+def test_the_view_uses_of_three_what_is_in_its_bundle() -> None:
+    page = Path(document.__file__).parent
+    used = set(re.findall(r"THREE\.(\w+)", (page / "page.js").read_text(encoding="utf-8")))
+    bundled = set(re.findall(r"\w+", (page / "vendored" / "three.entry.mjs").read_text(encoding="utf-8")))
+    assert used and used <= bundled
 
 
 def test_a_flight_keeps_its_first_and_last_row_and_its_speed() -> None:

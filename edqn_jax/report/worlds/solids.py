@@ -25,7 +25,7 @@ GROUND = "#f4f3ef"
 SHADOW = "#dedcd5"
 OUTLINE = "#a8a8a4"
 ABOVE_M = 1.0
-"""Metres above start and goal at which what is above them is cut off."""
+"""Metres above start and goal at which what is above them is cut off, and below them what a map shows no more."""
 NEARLY_ALL = 0.75
 """Share of the volume's width that a ceiling or an outer wall covers."""
 
@@ -89,8 +89,8 @@ def solids_of_shape(kind: ShapeKind, shape: Any) -> list[Solid]:
     return [Solid(list(faces), shape.albedo) for faces in parts]
 
 
-def cut_of(parts: Sequence[Solid], scene: Scene) -> float | None:
-    """Returns the height, metres, above which a shape of several parts hides flights: some of it is above their ends.
+def cut_of(parts: Sequence[Solid], scene: Scene) -> tuple[float, float] | None:
+    """Returns between which heights, metres, a shape of several parts is shown if some of it is above a flight's ends.
 
     None of what lies above neither start nor goal.
     """
@@ -98,7 +98,7 @@ def cut_of(parts: Sequence[Solid], scene: Scene) -> float | None:
     for solid in parts if len(parts) > 1 else ():
         low, high = solid.corners.min(0), solid.corners.max(0)
         if any(np.all(low[:2] <= end[:2]) and np.all(end[:2] <= high[:2]) and low[2] > end[2] for end in ends):
-            return float(max(end[2] for end in ends)) + ABOVE_M
+            return float(min(end[2] for end in ends)) - ABOVE_M, float(max(end[2] for end in ends)) + ABOVE_M
     return None
 
 
@@ -152,15 +152,17 @@ class CutawayView:
     """Whether a ceiling was left out."""
     moving: list[Solid]
     """What moves, where it is at time 0: drawn as outlines."""
-    cut: float | None = None
-    """Height, metres, above which a shape was cut off."""
+    cut: tuple[float, float] | None = None
+    """Heights, metres, between which a shape is shown."""
 
     @property
     def note(self) -> str:
         """Note on what was cut away, for the figure; empty if nothing was."""
         parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", self.near_walls)) if cut]
         notes = [f"{' and '.join(parts)} cut away"] if parts else []
-        notes += [] if self.cut is None else [f"cut off above {self.cut:.1f} m"]
+        if self.cut is not None:
+            low, high = self.cut
+            notes.append(f"cut off above {high:.1f} m" + (f", and below {low:.1f} m" if np.isfinite(low) else ""))
         return "; ".join(notes + (["outlined: what moves, as at the start"] if self.moving else []))
 
 
@@ -177,9 +179,11 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
     shown, near_walls, solids, cut = [], [], [], None
     for kind, shape in standing_rows(static_scene(scene)):
         parts = solids_of_shape(kind, shape)
-        above = cut_of(parts, scene)
-        if above is not None:
-            cut, parts = above, [low for each in parts if (low := _below(each, above)) is not None]
+        heights = cut_of(parts, scene)
+        if heights is not None:
+            # From above, all that is level has one colour: a map shows a slice.
+            cut = (heights[0] if view.elevation >= 89 else -np.inf, heights[1])
+            parts = [low for each in parts if (low := _below(each, cut[1])) and low.corners[:, 2].max() >= cut[0]]
         solids += parts
     for solid in solids:
         side = boundary_side(solid, lower, upper)

@@ -115,7 +115,7 @@ def _tilted_picture(
     layers = coverage.no_layers((config.height, config.width), numbered=surfaces is not None)
     for kind, met in raycast.hits(scene, origin, many, without=("spheres", "planes")).items():
         bright = raycast.brightness_of(light, met, value[kind])
-        layers = coverage.add_sampled_layers(met, bright, first[kind], many, layers, kind in coverage.SLOPED)
+        layers = coverage.add_sampled_layers(met, bright, first[kind], many, layers)
     layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
     sky = jnp.sum(jnp.asarray(light.sky) * weights)
     frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky, surfaces=surfaces)

@@ -41,7 +41,7 @@ LEVEL_FACE = 1e9
 """Value of `Layer.slope` for a face whose closeness changes with the row only."""
 
 SLOPED = ("fields",)
-"""Kinds of sampled layers with large faces, seen at any angle."""
+"""Kinds of sampled layers with large faces, whose texture a level camera averages along slopes, as that of boxes."""
 
 _LEVEL = 0.7  # of a unit normal: a face that is rather level than upright
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.sim.scene.mesh_field import Grid
 
-MOST_BOXES = 400
+MOST_BOXES = 800
 
 _FILLED_M = 0.01  # a point this near to a solid is drawn
 
@@ -23,7 +23,7 @@ def boxes_of_grid(grid: Grid) -> NDArray[np.float64]:
     low = -grid.cell * (np.array(filled.shape) / 2)
     stride, boxes = 1, _merged_boxes(filled)
     while len(boxes) > MOST_BOXES:
-        stride *= 2
+        stride += 1
         boxes = _merged_boxes(_coarser(filled, stride))
     return np.clip(low + stride * grid.cell * boxes, -grid.half, grid.half)
 

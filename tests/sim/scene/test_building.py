@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import xml.etree.ElementTree as ElementTree
 from types import ModuleType
 
 import jax
@@ -52,6 +53,14 @@ def rays_of_mujoco(places: np.ndarray) -> np.ndarray:
         there = mujoco.mj_ray(model, data, places[m], way / np.linalg.norm(way), None, 1, -1, geom)
         found[m, row, column] = np.inf if there < 0 else there
     return found
+
+
+def test_the_ground_floor_is_the_same_mesh_below_its_ceiling() -> None:
+    whole, floor = (ElementTree.parse(FILE.with_name(f"{name}.xml")).getroot() for name in ("building", "ground_floor"))
+    for kind in ("mesh", "geom", "light"):
+        assert [each.attrib for each in whole.iter(kind)] == [each.attrib for each in floor.iter(kind)]
+    (volume,) = (site for site in floor.iter("site") if site.get("name") == "volume")
+    assert (volume.get("pos"), volume.get("size")) == ("12 7 2", "12 7 2")
 
 
 @pytest.mark.slow
