@@ -263,7 +263,8 @@ def _with_a_way(pool: Scene, config: Config, name: str, own_start: bool = False)
     if own_start and not is_reachable(found, scene.start):
         shortest_path(scene, scene.start, scene.goal, radius)  # raises, before anything is compiled
     cells = cells_of(scene, found.is_way, found.corner, found.edge_m)
-    return cells, f"{found.lost:.0%} of the free space of '{name}' has no way to the goal: no mission begins there"
+    lost = f"{found.lost:.0%}" if found.lost >= 0.01 else "Less than 1%"
+    return cells, f"{lost} of the free space of '{name}' has no way to the goal: no mission begins there"
 
 
 def _starts_near(missions: Missions, start: np.ndarray, jitter_m: float) -> np.ndarray:
