@@ -368,7 +368,7 @@ class ExposureConfig:
     """Electrons that a pixel holds; at a gain of 1 they are white."""
     read_noise_e: Annotated[float, NOT_NEGATIVE] = 18.0
     """Standard deviation of the read noise, electrons."""
-    bits: Literal[8, 10, 12] = 8
+    bits: Annotated[int, Limit("8, 10 or 12", lambda value: value in (8, 10, 12))] = 8
     """Bits of a level."""
     metering_s: Annotated[float, NOT_NEGATIVE] = 0.0
     """Time constant with which exposure follows the brightness of the pictures, seconds. 0: the last decision's picture

@@ -11,7 +11,7 @@ from edqn_jax.cli import main
 from edqn_jax.errors import ConfigError
 from edqn_jax.fly.page import flight_page, happenings
 from edqn_jax.fly.records import RECORDS, FlightLog, read_records
-from tests.fly.test_pilot import Camera, make
+from tests.support.virtual_pilot import Camera, make
 
 
 def flown(folder: Path, **more: float) -> Path:

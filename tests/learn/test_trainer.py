@@ -118,7 +118,9 @@ def test_training_against_every_disturbance_stores_what_was_chosen_and_goes_on_f
 ) -> None:
     config = dataclasses.replace(
         TINY,
-        env=dataclasses.replace(TINY.env, sensor="blind", action_delay=1, delay_share=0.5, max_decisions=6),
+        env=dataclasses.replace(
+            TINY.env, sensor="blind", action_delay=1, delay_share=0.5, setpoint_m_s2=4.0, max_decisions=6
+        ),
         air=AirConfig(wind_m_s=5.0, gusts_m_s=3.0),
         body=BodyConfig(mass_share=0.2, inertia_share=0.2),
         motors=MotorsConfig(gain_share=0.2, lag_s=0.05),

@@ -8,18 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader  # pyright: ignore[reportMissingImports]
 
-pytest.importorskip("mcap")
-
-from mcap.reader import make_reader  # noqa: E402  # pyright: ignore[reportMissingImports]
-
-from edqn_jax.cli import fly as command  # noqa: E402
-from edqn_jax.errors import ConfigError  # noqa: E402
-from edqn_jax.fly.mcap_file import write_mcap  # noqa: E402
-from edqn_jax.fly.records import EVENTS, FlightLog, read_records  # noqa: E402
-from edqn_jax.fly.streams import HEADER, MAGIC, Decoder, read_stream  # noqa: E402
-from tests.fly.test_pilot import Policy, make  # noqa: E402
-from tests.support.virtual_flight import CAMERA  # noqa: E402
+from edqn_jax.cli import fly as command
+from edqn_jax.errors import ConfigError
+from edqn_jax.fly.mcap_file import write_mcap
+from edqn_jax.fly.records import EVENTS, FlightLog, read_records
+from edqn_jax.fly.streams import HEADER, MAGIC, Decoder, read_stream
+from tests.support.virtual_flight import CAMERA
+from tests.support.virtual_pilot import Policy, make
 
 
 @pytest.fixture
