@@ -18,7 +18,9 @@ from tyro.conf import arg
 
 from edqn_jax.cli.arguments import check_flags, flags_of_group
 from edqn_jax.cli.help import TRAIN, asks_for_help, flag_of, show_train_help
+from edqn_jax.cli.process.parsing import parse_or_say
 from edqn_jax.cli.process.signals import Stops
+from edqn_jax.cli.process.status import end_status, show_phase
 from edqn_jax.cli.process.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import apply_layer, load_layer, resolve_config, to_yaml
@@ -109,7 +111,9 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     everything = "--help-all" in argv
     helped = everything or asks_for_help(argv)
     argv = [word for word in argv if word not in ("-h", "--help", "--help-all")]
-    options, _ = tyro.cli(TrainOptions, args=argv, prog=TRAIN, return_unknown_args=True, add_help=False)
+    options, _ = parse_or_say(
+        lambda: tyro.cli(TrainOptions, args=argv, prog=TRAIN, return_unknown_args=True, add_help=False), TRAIN
+    )
     if options.seeds is not None and options.seeds < 1:
         raise ConfigError(f"--seeds must be at least 1, not {options.seeds}")
     tuned_for = detect_hardware() if options.tuned_for == "auto" else options.tuned_for
@@ -191,7 +195,8 @@ def _long_name(word: str) -> str:
 
 
 def _parse_config(argv: Sequence[str], base: Config) -> Config:
-    return tyro.cli(TrainCommand, args=argv, prog=TRAIN, default=TrainCommand(config=base)).config
+    begins = TrainCommand(config=base)
+    return parse_or_say(lambda: tyro.cli(TrainCommand, args=argv, prog=TRAIN, default=begins), TRAIN).config
 
 
 def train_command(argv: Sequence[str], stops: Stops) -> None:
@@ -206,6 +211,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     several = options.coordinator_address, options.num_processes, options.process_id
     arguments = how_to_join(options.distributed, *several, os.environ)
 
+    show_phase("starting JAX")
     start_jax(alone=arguments is None)
 
     import jax
@@ -235,7 +241,9 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     run = processes.run_synchronised(
         lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None
     )
-    progress = Progress(Console(quiet=not writes))
+    # A panel on a terminal has clocks of its own.
+    tell = (lambda _: end_status()) if sys.stdout.isatty() else show_phase
+    progress = Progress(Console(quiet=not writes), tell=tell)
     if is_tuned_for_gpu(options, config):
         progress.message(_describe_choice(config))
     for warning in warn_of_training(config) if writes else ():
