@@ -36,6 +36,7 @@ from edqn_jax.runs.directory import Resume, RunDirectory, plan_run_directory
 
 if TYPE_CHECKING:
     from edqn_jax.interop import tracking
+    from edqn_jax.learn.policy import Policy
 
 
 SHORT_NAMES = {
@@ -220,9 +221,9 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     from edqn_jax.devices.cache import enable_compilation_cache
     from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
     from edqn_jax.devices.hardware import count_cores
-    from edqn_jax.evaluation.world_check import warn_of_training
     from edqn_jax.report.gallery import prepare_gallery
     from edqn_jax.report.progress import Progress
+    from edqn_jax.runs.policies import load_policy
     from edqn_jax.runs.stopping import Stop
 
     most = 1 if config.train.debug else most_that_divide(config.train.shards, count_cores())
@@ -246,15 +247,14 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     progress = Progress(Console(quiet=not writes), tell=tell)
     if is_tuned_for_gpu(options, config):
         progress.message(_describe_choice(config))
-    for warning in warn_of_training(config) if writes else ():
+    start = None if options.start_from is None else load_policy(options.start_from)
+    for warning in _warnings(config, start) if writes else ():
         progress.message(warning)
     sinks = None if run is None else _sinks_of(options, config, run, progress.message)
     stop = Stop(stops.is_requested, lambda: stops.obey_signals(progress.message))
     try:
-        from edqn_jax.runs.policies import load_policy
         from edqn_jax.runs.record import train_run
 
-        start = None if options.start_from is None else load_policy(options.start_from)
         others = {"drawing": prepare_gallery, "seeds": options.seeds, "start": start}
         train_run(config, run, progress, stop, callback=sinks, **others)
     except jax.errors.JaxRuntimeError as error:
@@ -265,6 +265,16 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
         if sinks is not None:
             sinks.close()
         progress.stop()
+
+
+def _warnings(config: Config, start: Policy | None) -> tuple[str, ...]:
+    """Returns what is worth saying of the world of a training, and of what the policy that it begins with never met."""
+    from edqn_jax.evaluation.world_check import warn_of_training
+    from edqn_jax.policies.unseen import describe_unseen
+
+    if start is None:
+        return warn_of_training(config)
+    return (*warn_of_training(config, start.config), *describe_unseen(start.config, config))
 
 
 def _check_sinks(options: TrainOptions) -> None:
