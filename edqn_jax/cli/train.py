@@ -37,6 +37,7 @@ from edqn_jax.runs.directory import Resume, RunDirectory, plan_run_directory
 if TYPE_CHECKING:
     from edqn_jax.interop import tracking
     from edqn_jax.learn.policy import Policy
+    from edqn_jax.report.progress import Progress
 
 
 SHORT_NAMES = {
@@ -222,7 +223,6 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
     from edqn_jax.devices.hardware import count_cores
     from edqn_jax.report.gallery import prepare_gallery
-    from edqn_jax.report.progress import Progress
     from edqn_jax.runs.policies import load_policy
     from edqn_jax.runs.stopping import Stop
 
@@ -242,9 +242,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     run = processes.run_synchronised(
         lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None
     )
-    # A panel on a terminal has clocks of its own.
-    tell = (lambda _: end_status()) if sys.stdout.isatty() else show_phase
-    progress = Progress(Console(quiet=not writes), tell=tell)
+    progress = _open_progress(writes)
     if is_tuned_for_gpu(options, config):
         progress.message(_describe_choice(config))
     start = None if options.start_from is None else load_policy(options.start_from)
@@ -265,6 +263,14 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
         if sinks is not None:
             sinks.close()
         progress.stop()
+
+
+def _open_progress(writes: bool) -> Progress:
+    """Returns what shows the progress of a run, in place of the status where that is a panel with clocks of its own."""
+    from edqn_jax.report.progress import Progress
+
+    tell = (lambda _: end_status()) if sys.stdout.isatty() else show_phase
+    return Progress(Console(quiet=not writes), tell=tell)
 
 
 def _warnings(config: Config, start: Policy | None) -> tuple[str, ...]:
