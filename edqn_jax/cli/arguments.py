@@ -11,6 +11,7 @@ from typing import TypeVar
 import tyro
 
 from edqn_jax.cli.help import ABOUT, asks_for_help, flag_of, print_help, with_help_texts
+from edqn_jax.cli.process.parsing import parse_or_say
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.policies import function_named, no_run, policy_folder
@@ -19,18 +20,49 @@ Point = tuple[float, float, float]
 
 Args = TypeVar("Args")
 
+MEANINGS = {
+    "lr": "learning-rate",
+    "step-size": "learning-rate",
+    "alpha": "learning-rate",
+    "gamma": "discount",
+    "discount-factor": "discount",
+    "envs": "num-envs",
+    "n-envs": "num-envs",
+    "environments": "num-envs",
+    "steps": "total-steps",
+    "num-steps": "total-steps",
+    "timesteps": "total-steps",
+    "total-timesteps": "total-steps",
+    "batch": "batch-size",
+    "minibatch-size": "batch-size",
+    "buffer-size": "replay-size",
+    "memory-size": "replay-size",
+    "epsilon": "exploration-start",
+    "tau": "target-rate",
+    "env": "world",
+    "map": "world",
+    "scene": "world",
+    "num-missions": "missions",
+    "log-dir": "run-dir",
+    "output-dir": "run-dir",
+    "algorithm": "learner",
+    "speed": "speed-m-s",
+    "fov": "horizontal-fov-deg",
+}
+"""Names that people know from elsewhere, and the last part of the option that means it, where a command has one."""
+
 
 def parse_arguments(kind: type[Args], argv: Sequence[str], command: str) -> Args:
     """Returns the arguments of a command.
 
     Raises:
-        ConfigError: if there is no such flag.
-        SystemExit: after printing, for --help and for arguments that do not parse.
+        ConfigError: if there is no such flag, or a value does not parse.
+        SystemExit: after printing, for --help.
     """
     check_flags(argv, flags_of(kind), command)
     if asks_for_help(argv):
         print_help(with_help_texts(kind), command, ABOUT[command])
-    return tyro.cli(kind, args=argv, prog=command)
+    return parse_or_say(lambda: tyro.cli(kind, args=argv, prog=command), command)
 
 
 def check_flags(argv: Sequence[str], known: Iterable[str], command: str) -> None:
@@ -58,11 +90,17 @@ def _initials(flag: str) -> str:
 def _nearest_flag(flag: str, known: Iterable[str]) -> str | None:
     """Returns the flag nearest to an unknown one: shortened, without its group or misspelt; None if none is near.
 
-    Flags that begin with the given one come first, then those of that name in a group, then those of these initials
+    Flags that mean the same come first, then those that begin with the given one, then those of that name in a group,
+    then those of these initials
     (`lr`, `agent.lr`), then similar spellings.
     """
     shortest_first = sorted(known, key=lambda name: (len(name), name))
     bare = flag.removeprefix("--")
+    group, dot, last_name = bare.rpartition(".")
+    if (meant := MEANINGS.get(last_name)) is not None:
+        for ending in (f"--{group}{dot}{meant}", f"--{meant}", f".{meant}"):
+            if same := [name for name in shortest_first if name.endswith(ending)]:
+                return same[0]
     for is_meant in (
         lambda name: len(bare) > 1 and name.startswith(flag),
         lambda name: name.endswith(f".{bare}"),

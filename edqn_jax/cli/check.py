@@ -16,6 +16,7 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import Point, check_run, parse_arguments
 from edqn_jax.cli.help import CHECK
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.policies import PRETRAINED
@@ -72,6 +73,8 @@ def check_command(args: CheckArgs) -> None:
         CheckError: if it cannot be flown there; says why.
         ConfigError: if the policy, the world or a file to write is not as it should be.
     """
+    show_phase("looking at the world")
+
     from edqn_jax.evaluation.world_check import check_world
     from edqn_jax.policies.functions import config_of
     from edqn_jax.runs.directory import to_plain_json
@@ -89,6 +92,8 @@ def check_command(args: CheckArgs) -> None:
         figures = to_plain_json({"policy": str(args.policy), **found.figures()})
         write_atomically(args.json, json.dumps(figures, indent=2, allow_nan=False) + "\n")
     if args.out is not None and found.scene is not None:
+        show_phase("drawing")
+
         from edqn_jax.report.worlds.check_map import plot_check
 
         title = f"{Path(found.name).name}: {_verdict(found)}"

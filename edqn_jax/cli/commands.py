@@ -17,6 +17,7 @@ from edqn_jax.cli.export import ExportArgs, export_command, parse_export
 from edqn_jax.cli.fly import FlyArgs, fly_command, parse_fly
 from edqn_jax.cli.help import ABOUT
 from edqn_jax.cli.process.signals import Stops
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.cli.process.variables import check_devices, start_jax
 from edqn_jax.cli.record import RecordArgs, parse_record, record_command
 from edqn_jax.cli.report import ReportArgs, parse_report, report_command
@@ -69,12 +70,12 @@ RUN_COMMANDS = {
 """Commands on a finished run, a world or a file: what parses their arguments, without JAX, and what runs them."""
 
 
-def run_command(argv: Sequence[str] | None, stops: Stops) -> int:
+def run_command(argv: Sequence[str], stops: Stops) -> int:
     """Runs one command and returns its exit code.
 
     0 is done, 1 a check failed, 2 bad input, 3 diverged, 130 stopped by SIGINT, and 143 by SIGTERM.
     """
-    return _exit_code_of(list(sys.argv[1:] if argv is None else argv), stops)
+    return _exit_code_of(list(argv), stops)
 
 
 def _exit_code_of(argv: list[str], stops: Stops) -> int:
@@ -178,6 +179,7 @@ def _dispatch_run_command(command: str, argv: Sequence[str]) -> None:
 
 
 def _start_jax_on_cpus() -> None:
+    show_phase("starting JAX")
     start_jax()
 
     from edqn_jax.devices.cache import enable_compilation_cache

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +15,8 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import Point, check_flags, check_run, flags_of, flags_of_group, print_notes
 from edqn_jax.cli.help import ABOUT, EVALUATE, asks_for_help, print_help, with_conditions, with_help_texts
+from edqn_jax.cli.process.parsing import parse_or_say
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.config import CONDITIONS
 from edqn_jax.config.presets import Layer
 from edqn_jax.errors import ConfigError
@@ -72,7 +72,7 @@ def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
     check_flags(argv, flags_of(EvaluateArgs) | set(flags), EVALUATE)
     if asks_for_help(argv):
         print_help(kind, EVALUATE, ABOUT[EVALUATE])
-    parsed: Any = tyro.cli(kind, args=argv, prog=EVALUATE)
+    parsed: Any = parse_or_say(lambda: tyro.cli(kind, args=argv, prog=EVALUATE), EVALUATE)
     conditions: dict[str, dict[str, Any]] = {}
     for word in argv:
         group, option = flags.get(word.partition("=")[0].replace("_", "-"), ("", ""))
@@ -92,6 +92,8 @@ def evaluate_command(args: EvaluateArgs) -> None:
     Raises:
         ConfigError: if the run, the world or a file to write is not as it should be.
     """
+    show_phase("loading the policy")
+
     from edqn_jax.evaluation.evaluate import evaluate
     from edqn_jax.evaluation.latency import decision_latency_ms
     from edqn_jax.evaluation.trajectories import write_trajectories
@@ -107,21 +109,21 @@ def evaluate_command(args: EvaluateArgs) -> None:
     if args.json is not None and args.trajectories is not None and args.json.resolve() == args.trajectories.resolve():
         raise ConfigError(f"--json and --trajectories are both '{args.json}'; give two files")
     policy = find_policy(args.run, args.world)
-    with _shown_phases() as phase:
-        evaluation = evaluate(
-            policy,
-            args.world,
-            missions=args.missions,
-            seed=args.seed,
-            start=args.start,
-            goal=args.goal,
-            record=args.trajectories is not None,
-            shuffle_codes=args.shuffle_codes,
-            decoder=args.decoder,
-            conditions=args.conditions,
-            phase=phase,
-        )
+    evaluation = evaluate(
+        policy,
+        args.world,
+        missions=args.missions,
+        seed=args.seed,
+        start=args.start,
+        goal=args.goal,
+        record=args.trajectories is not None,
+        shuffle_codes=args.shuffle_codes,
+        decoder=args.decoder,
+        conditions=args.conditions,
+        phase=show_phase,
+    )
     config = config_of(policy)
+    show_phase("measuring the latency")
     figures = {
         "run": str(args.run),
         **_policy_source(policy, args.run),
@@ -141,21 +143,6 @@ def evaluate_command(args: EvaluateArgs) -> None:
         write_atomically(args.json, json.dumps(to_plain_json(figures), indent=2, allow_nan=False) + "\n")
     if args.trajectories is not None:
         write_trajectories(config, evaluation.missions, evaluation.flights, args.trajectories)
-
-
-@contextlib.contextmanager
-def _shown_phases() -> Iterator[Callable[[str], None]]:
-    """Yields a function that shows a phase, with its clock, on standard error where that is a terminal."""
-    from edqn_jax.report.progress import Progress
-
-    if not sys.stderr.isatty():
-        yield lambda _: None
-        return
-    progress = Progress(Console(stderr=True))
-    try:
-        yield progress.phase
-    finally:
-        progress.stop()
 
 
 def _policy_source(policy: Policy | FunctionPolicy, run: Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import Point, check_is_saved, check_run, parse_arguments
 from edqn_jax.cli.help import EVENTS
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write, write_atomically
 
@@ -124,15 +125,19 @@ def events_command(args: EventsArgs) -> None:
             check_can_write(file)
     if args.out is not None:
         check_can_write_events(args.out)
+    show_phase("reading the events")
     whole = read_events(args.file, size=args.size, time_unit=args.time_unit, columns=args.columns, stream=args.stream)
     recording = whole.between(args.start, args.stop)
     figures: dict[str, Any] = {"file": str(args.file), **recording_figures(recording)}
+    show_phase("looking at the events")
     strips, times_s, period_s = _strips(args, recording, figures)
     Console().print(recording_table(figures))
     if args.policy is not None:
         for note in _notes(args, recording, figures["seen"]):
             print(note)
     if args.picture is not None:
+        show_phase("drawing")
+
         from edqn_jax.report.recordings import animate_recording, plot_recording
 
         if args.picture.suffix.lower() == ".gif":
@@ -140,6 +145,7 @@ def events_command(args: EventsArgs) -> None:
         else:
             plot_recording(strips, times_s, args.picture)
     if args.out is not None:
+        show_phase("writing the events")
         write_events(args.out, recording)
     if args.json is not None:
         write_atomically(args.json, json.dumps(to_plain_json(figures), indent=2, allow_nan=False) + "\n")

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import check_is_saved, check_run, parse_arguments
 from edqn_jax.cli.help import EXPORT
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.errors import ConfigError
 
 
@@ -48,6 +49,8 @@ def export_command(args: ExportArgs) -> None:
         CheckError: if ONNX and JAX do not agree.
         ConfigError: if the run or the file to write is not as it should be.
     """
+    show_phase("exporting and comparing with JAX")
+
     from edqn_jax.interop.deployment.onnx_export import export_policy
     from edqn_jax.runs.policies import load_policy, policy_digest
 

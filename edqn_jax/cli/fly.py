@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg
 from edqn_jax.cli.arguments import Point, check_is_saved, check_run, parse_arguments
 from edqn_jax.cli.help import FLY
 from edqn_jax.cli.process.signals import Stops
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.errors import CheckError, ConfigError, StoppedError, suggest_nearest
 from edqn_jax.files import check_can_write, write_atomically
 
@@ -223,6 +224,7 @@ def fly(args: FlyArgs, stops: Stops) -> None:
             stack.callback(clock.close)
         stack.enter_context(stops.obey_signals(lambda _: None))
         task = Task(settings, np.reshape(args.volume, (2, 3)), args.pace, args.dry, args.fov, args.contrast, lens)
+        show_phase("flying")
         pilot = Pilot(runner, link, source, clock, task, log=log, stop=stops.is_requested)
         try:
             report = pilot.fly()
@@ -322,6 +324,7 @@ def replay(args: FlyArgs, folder: Path) -> None:
     from edqn_jax.fly.replay import replay as play
     from edqn_jax.interop.recordings.lens import read_lens
 
+    show_phase("playing the flight again")
     begun = next((each for each in read_records(folder) if each["kind"] == "settings"), None)
     runner = None
     if begun is not None:
@@ -359,6 +362,7 @@ def simulate(args: FlyArgs) -> None:
     from edqn_jax.runs.policies import load_policy
 
     assert args.simulate is not None
+    show_phase("exporting the policy")
     policy = load_policy(args.policy)
     asked = args.simulate, policy.config, args.missions, args.seed
     ended = []
@@ -373,8 +377,10 @@ def simulate(args: FlyArgs) -> None:
             if args.jobs == 1
             else fly_at_once(*asked, setup, jobs=args.jobs)
         )
+        show_phase("flying", 0, args.missions)
         for mission in flown:
             ended = sorted([*ended, mission], key=lambda each: each.number)
+            show_phase("flying", len(ended), args.missions)
             print(
                 f"mission {mission.number}: {mission.outcome} after {mission.seconds:.1f} s, {mission.clearance_m:.2f} "
                 f"m clear at least; {mission.events_hz:,.0f} events/s; {mission.speed:.2f} simulated seconds a second; "

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import Point, check_run, parse_arguments, print_notes
 from edqn_jax.cli.help import RECORD
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import EVENT_FILES, VIDEO
 
@@ -66,12 +67,15 @@ def record_command(args: RecordArgs) -> None:
         ConfigError: if the policy, the world or the file to write is not as it should be.
         MissingPackageError: if the file to write needs an extra that is not installed.
     """
+    show_phase("loading the policy")
+
     from edqn_jax.interop.flight_files import record
     from edqn_jax.report.style import OUTCOME_LABELS
     from edqn_jax.runs.policies import find_policy
 
     policy = find_policy(args.run, args.world)
-    done = record(policy, args.file, args.world, start=args.start, goal=args.goal, seed=args.seed, size=args.size)
+    where = {"start": args.start, "goal": args.goal}
+    done = record(policy, args.file, args.world, **where, seed=args.seed, size=args.size, phase=show_phase)
     print_notes(args.run, args.world, done.missions.note)
     print(
         f"{OUTCOME_LABELS[done.outcome]} after {done.seconds:.1f} s; '{args.file}' has "

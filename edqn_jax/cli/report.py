@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import check_run, parse_arguments
 from edqn_jax.cli.help import REPORT
+from edqn_jax.cli.process.status import say_phase, show_phase
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write, write_atomically
 
@@ -80,8 +80,10 @@ def report_command(args: ReportArgs) -> None:
 
         page = flight_page(args.runs[0]).encode()
     else:
+        show_phase("reading the runs")
+
         from edqn_jax.report.page.document import build_report
 
-        page = build_report(args.runs, args.missions, functools.partial(print, flush=True)).encode()
+        page = build_report(args.runs, args.missions, say_phase).encode()
     write_atomically(args.out, page)
     print(f"'{args.out}' has {len(page) / 1e6:.1f} MB; open it in a browser")

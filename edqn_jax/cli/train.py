@@ -18,7 +18,9 @@ from tyro.conf import arg
 
 from edqn_jax.cli.arguments import check_flags, flags_of_group
 from edqn_jax.cli.help import TRAIN, asks_for_help, flag_of, show_train_help
+from edqn_jax.cli.process.parsing import parse_or_say
 from edqn_jax.cli.process.signals import Stops
+from edqn_jax.cli.process.status import end_status, show_phase
 from edqn_jax.cli.process.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import apply_layer, load_layer, resolve_config, to_yaml
@@ -34,6 +36,8 @@ from edqn_jax.runs.directory import Resume, RunDirectory, plan_run_directory
 
 if TYPE_CHECKING:
     from edqn_jax.interop import tracking
+    from edqn_jax.learn.policy import Policy
+    from edqn_jax.report.progress import Progress
 
 
 SHORT_NAMES = {
@@ -109,7 +113,9 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     everything = "--help-all" in argv
     helped = everything or asks_for_help(argv)
     argv = [word for word in argv if word not in ("-h", "--help", "--help-all")]
-    options, _ = tyro.cli(TrainOptions, args=argv, prog=TRAIN, return_unknown_args=True, add_help=False)
+    options, _ = parse_or_say(
+        lambda: tyro.cli(TrainOptions, args=argv, prog=TRAIN, return_unknown_args=True, add_help=False), TRAIN
+    )
     if options.seeds is not None and options.seeds < 1:
         raise ConfigError(f"--seeds must be at least 1, not {options.seeds}")
     tuned_for = detect_hardware() if options.tuned_for == "auto" else options.tuned_for
@@ -191,7 +197,8 @@ def _long_name(word: str) -> str:
 
 
 def _parse_config(argv: Sequence[str], base: Config) -> Config:
-    return tyro.cli(TrainCommand, args=argv, prog=TRAIN, default=TrainCommand(config=base)).config
+    begins = TrainCommand(config=base)
+    return parse_or_say(lambda: tyro.cli(TrainCommand, args=argv, prog=TRAIN, default=begins), TRAIN).config
 
 
 def train_command(argv: Sequence[str], stops: Stops) -> None:
@@ -206,6 +213,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     several = options.coordinator_address, options.num_processes, options.process_id
     arguments = how_to_join(options.distributed, *several, os.environ)
 
+    show_phase("starting JAX")
     start_jax(alone=arguments is None)
 
     import jax
@@ -214,9 +222,8 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     from edqn_jax.devices.cache import enable_compilation_cache
     from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
     from edqn_jax.devices.hardware import count_cores
-    from edqn_jax.evaluation.world_check import warn_of_training
     from edqn_jax.report.gallery import prepare_gallery
-    from edqn_jax.report.progress import Progress
+    from edqn_jax.runs.policies import load_policy
     from edqn_jax.runs.stopping import Stop
 
     most = 1 if config.train.debug else most_that_divide(config.train.shards, count_cores())
@@ -235,18 +242,17 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     run = processes.run_synchronised(
         lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None
     )
-    progress = Progress(Console(quiet=not writes))
+    progress = _open_progress(writes)
     if is_tuned_for_gpu(options, config):
         progress.message(_describe_choice(config))
-    for warning in warn_of_training(config) if writes else ():
+    start = None if options.start_from is None else load_policy(options.start_from)
+    for warning in _warnings(config, start) if writes else ():
         progress.message(warning)
     sinks = None if run is None else _sinks_of(options, config, run, progress.message)
     stop = Stop(stops.is_requested, lambda: stops.obey_signals(progress.message))
     try:
-        from edqn_jax.runs.policies import load_policy
         from edqn_jax.runs.record import train_run
 
-        start = None if options.start_from is None else load_policy(options.start_from)
         others = {"drawing": prepare_gallery, "seeds": options.seeds, "start": start}
         train_run(config, run, progress, stop, callback=sinks, **others)
     except jax.errors.JaxRuntimeError as error:
@@ -257,6 +263,24 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
         if sinks is not None:
             sinks.close()
         progress.stop()
+
+
+def _open_progress(writes: bool) -> Progress:
+    """Returns what shows the progress of a run, in place of the status where that is a panel with clocks of its own."""
+    from edqn_jax.report.progress import Progress
+
+    tell = (lambda _: end_status()) if sys.stdout.isatty() else show_phase
+    return Progress(Console(quiet=not writes), tell=tell)
+
+
+def _warnings(config: Config, start: Policy | None) -> tuple[str, ...]:
+    """Returns what is worth saying of the world of a training, and of what the policy that it begins with never met."""
+    from edqn_jax.evaluation.world_check import warn_of_training
+    from edqn_jax.policies.unseen import describe_unseen
+
+    if start is None:
+        return warn_of_training(config)
+    return (*warn_of_training(config, start.config), *describe_unseen(start.config, config))
 
 
 def _check_sinks(options: TrainOptions) -> None:

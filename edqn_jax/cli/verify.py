@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import check_is_saved, parse_arguments
 from edqn_jax.cli.help import VERIFY
+from edqn_jax.cli.process.status import say_phase, show_phase
 from edqn_jax.errors import CheckError
 from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.policies import no_run
@@ -57,9 +57,10 @@ def verify_command(args: VerifyArgs) -> None:
     """
     from edqn_jax.runs.verification.verify import verify_run
 
+    show_phase("reading the run")
     if args.json is not None:
         check_can_write(args.json)
-    findings = verify_run(args.run, functools.partial(print, flush=True))
+    findings = verify_run(args.run, say_phase)
     Console().print(findings_table(findings))
     if args.json is not None:
         found = {"run": str(args.run), "findings": [dataclasses.asdict(finding) for finding in findings]}

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import Point, parse_arguments
 from edqn_jax.cli.help import WORLD
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_make, write_atomically
 
@@ -71,7 +72,9 @@ def world_command(args: WorldArgs) -> None:
 
     check_can_make(args.out)
     options = ScanOptions(args.scale, args.up, args.thickness, args.start, args.goal)
+    show_phase("reading the scan")
     scan = read_scan(args.scan, options)
+    show_phase("making the world")
     mjcf, mesh, grid = world_of_scan(scan, options, Config().drone.body_radius_m)
     args.out.mkdir(parents=True, exist_ok=True)
     write_atomically(args.out / f"{NAME}.obj", mesh)

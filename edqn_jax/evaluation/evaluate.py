@@ -22,6 +22,7 @@ from edqn_jax.evaluation.places import Point
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import Function, FunctionPolicy, actor_of, as_policy, config_of
+from edqn_jax.policies.unseen import describe_unseen
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
@@ -122,7 +123,7 @@ def evaluate(
     )
     phase("shortest paths")
     shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
-    notes = " ".join(filter(None, (mission_set.note, _unseen_look(policy, config))))
+    notes = "\n".join(filter(None, (mission_set.note, *_unseen(policy, config))))
     mission_set = dataclasses.replace(mission_set, note=notes or None)
     return Evaluation(mission_set, flights, _figures(config, flights, shortest))
 
@@ -135,12 +136,9 @@ def _figures(config: Config, flights: Flights, shortest: np.ndarray) -> dict[str
     return figures
 
 
-def _unseen_look(policy: Policy | FunctionPolicy, config: Config) -> str | None:
-    """Returns a sentence on a policy that has seen one plaid alone and flies under another look; None for others."""
-    pattern = config.surface.pattern
-    if isinstance(policy, FunctionPolicy) or policy.config.surface.pattern != "plaid" or pattern == "plaid":
-        return None
-    return f"this policy was trained with surface.pattern plaid alone; with {pattern} it sees what it never learnt"
+def _unseen(policy: Policy | FunctionPolicy, config: Config) -> list[str]:
+    """Returns what a policy was not trained with; nothing is known of a function."""
+    return [] if isinstance(policy, FunctionPolicy) else describe_unseen(policy.config, config)
 
 
 def _check_can_shuffle(config: Config, missions: int) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,17 @@ from edqn_jax.sim.task.flights import Flights, Record, at_start, update_tallies
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
+
+
+class ShowPhase(Protocol):
+    """What is called as a phase of work begins, and again as parts of it are done."""
+
+    def __call__(self, name: str, done: int = 0, total: int = 0, /) -> None:
+        """Takes the name of the phase and, where it has parts, how many are done, of how many."""
+
+
+def show_nothing(name: str, done: int = 0, total: int = 0, /) -> None:
+    """Shows no phase."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -175,25 +175,36 @@ def check_world(
 
 
 def warn_of_missions(config: Config, missions: MissionSet) -> tuple[str, ...]:
-    """Returns the warnings of `check_world` for missions in a world from a file; none for random worlds."""
+    """Returns the warnings of `check_world` for missions in a world from a file; of random worlds, of their size."""
     if missions.file is None:
-        return ()
+        return tuple(_warn_of_family(config, missions.name, trained_sizes(config)))
     return _warn_quickly(config, missions.name, missions.scene(), trained_sizes(config))
 
 
-def warn_of_training(config: Config) -> tuple[str, ...]:
-    """Returns the warnings of `check_world` for the file that a policy is to be trained in; none for random worlds.
+def warn_of_training(config: Config, start: Config | None = None) -> tuple[str, ...]:
+    """Returns the warnings of `check_world` for the file that a policy is to be trained in; of random worlds, of size.
 
-    A file that is no world has none either: training refuses it.
+    A file that is no world has none: training refuses it.
+
+    Args:
+        config: of the training.
+        start: of the policy that it begins with, and whose worlds had other sizes; None is none.
     """
-    name = config.world.name
+    name, trained_in = config.world.name, {} if start is None else trained_sizes(start)
     if name in FAMILIES:
-        return ()
+        return tuple(_warn_of_family(config, name, trained_in))
     try:
         scene = load_world(resolve_world(name)).scene
     except ConfigError:
         return ()
-    return _warn_quickly(config, name, scene, {})
+    return _warn_quickly(config, name, scene, trained_in)
+
+
+def _warn_of_family(config: Config, name: str, trained_in: Mapping[str, Point]) -> list[str]:
+    """Returns a warning if some of a family's worlds are much larger than those that the policy was trained in."""
+    there = dataclasses.replace(config, world=dataclasses.replace(config.world, name=name))
+    sizes = [] if name not in FAMILIES else [_sorted_sides(size) for size in trained_sizes(there).values()]
+    return _warn_of_sides(np.max(sizes, axis=0), trained_in) if sizes else []
 
 
 def _warn_quickly(config: Config, name: str, scene: Scene, trained_in: Mapping[str, Point]) -> tuple[str, ...]:
@@ -316,10 +327,14 @@ def _warn_of_length(config: Config, way: WidestWay) -> list[str]:
 
 def _warn_of_size(found: WorldCheck, scene: Scene) -> list[str]:
     """Returns a warning if a world is much larger than those that the policy was trained in."""
-    if not found.trained_in:
+    return _warn_of_sides(_sorted_sides(np.subtract(*np.asarray(scene.volume, np.float64)[::-1])), found.trained_in)
+
+
+def _warn_of_sides(sides: np.ndarray, trained_in: Mapping[str, Point]) -> list[str]:
+    """Returns a warning if sides [3] of a volume, metres, sorted, are much longer than the known ones."""
+    if not trained_in:
         return []
-    sides = _sorted_sides(np.subtract(*np.asarray(scene.volume, np.float64)[::-1]))
-    known = np.max([_sorted_sides(size) for size in found.trained_in.values()], axis=0)
+    known = np.max([_sorted_sides(size) for size in trained_in.values()], axis=0)
     if np.all(sides <= LARGER * known):
         return []
     here, there = (" × ".join(f"{side:.4g}" for side in each) for each in (sides, known))

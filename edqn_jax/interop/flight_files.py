@@ -12,7 +12,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.places import Point
-from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.evaluation.rollouts import ShowPhase, fly_on_all_devices, show_nothing
 from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.files import EVENT_FILES, VIDEO, check_can_write, write_atomically
 from edqn_jax.learn.policy import Policy
@@ -44,6 +44,7 @@ def record(
     goal: Point | None = None,
     seed: int = 0,
     size: tuple[int, int] | None = None,
+    phase: ShowPhase = show_nothing,
 ) -> Recorded:
     """Flies a policy once and writes the flight, in place of a file of that name.
 
@@ -55,6 +56,7 @@ def record(
         start, goal: metres, in place of the world's.
         seed: number of the test world of a family; elsewhere it only changes the sensor's noise.
         size: pixels across and down of the camera whose events are written; None are the policy's.
+        phase: called as each phase begins, and after each frame that is drawn.
 
     Raises:
         ConfigError: if the policy cannot fly there, or the file cannot be written or has another ending.
@@ -71,16 +73,17 @@ def record(
     config = config_of(policy)
     # Of several drones the whole group is flown, and the first one's flight is shown.
     own = config.world.name if group.is_multi_drone(config) else config.world.flown or config.world.name
+    phase("preparing the world")
     missions = load_missions(config, str(world or own), config.env.drones, seed, start, goal)
     if suffix in VIDEO:
-        flights = _write_video(file, policy, config, missions, seed)
+        flights = _write_video(file, policy, config, missions, seed, phase)
     else:
-        flights = _write_events(file, policy, config, missions, seed, size)
+        flights = _write_events(file, policy, config, missions, seed, size, phase)
     return Recorded(_ending(flights), float(flights.flight_seconds[0]), missions)
 
 
 def _write_video(
-    file: Path, policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int
+    file: Path, policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int, phase: ShowPhase
 ) -> Flights:
     from edqn_jax.report.animation import animate_flight
     from edqn_jax.report.sights import FlightRenderer
@@ -88,11 +91,13 @@ def _write_video(
     scene = scene_of_flight(config, missions)
     with ThreadPoolExecutor(2, thread_name_prefix="compiling") as pool:
         sights = FlightRenderer(config, scene, pool, decodes=isinstance(policy, Policy))
-        flights = _fly_missions(policy, config, missions, seed)
+        flights = _fly_missions(policy, config, missions, seed, phase)
+        phase("drawing")
         sights = sights.in_world(scene_of_flight(config, missions, flights))
         name = missions.name if missions.file is None else Path(missions.name).stem
         flight, ended = flight_trajectory(config, flights), _ending(flights)
-        video = animate_flight(sights, policy.params, flight, ended, title=f"world '{name}'", form=file.suffix.lower())
+        title, form = f"world '{name}'", file.suffix.lower()
+        video = animate_flight(sights, policy.params, flight, ended, title, form, phase)
     write_atomically(file, video)
     return flights
 
@@ -104,20 +109,24 @@ def _write_events(
     missions: MissionSet,
     seed: int,
     size: tuple[int, int] | None,
+    phase: ShowPhase,
 ) -> Flights:
     from edqn_jax.interop.recordings.event_files import check_can_write_events, write_events
     from edqn_jax.interop.recordings.flight_events import flight_recording
 
     group.check_alone(config, "`edqn record` of events")
     check_can_write_events(file)
-    flights = _fly_missions(policy, config, missions, seed)
+    flights = _fly_missions(policy, config, missions, seed, phase)
+    phase("drawing what the camera sees")
     write_events(file, flight_recording(config, missions.env_params, flight_trajectory(config, flights), size))
     return flights
 
 
-def _fly_missions(policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int) -> Flights:
+def _fly_missions(
+    policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int, phase: ShowPhase
+) -> Flights:
     actor = actor_of(policy, config)
-    return fly_on_all_devices(config, missions.env_params, policy.params, seed, actor=actor, record=True)
+    return fly_on_all_devices(config, missions.env_params, policy.params, seed, actor=actor, record=True, phase=phase)
 
 
 def _ending(flights: Flights) -> str:

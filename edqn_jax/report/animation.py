@@ -21,6 +21,7 @@ from matplotlib.patches import Wedge
 from PIL import Image
 
 from edqn_jax.evaluation.decoder import NEAR_M
+from edqn_jax.evaluation.rollouts import ShowPhase, show_nothing
 from edqn_jax.evaluation.trajectories import POSITION, columns_of
 from edqn_jax.extras import require_extra
 from edqn_jax.learn.policy import PolicyParams
@@ -60,6 +61,7 @@ def animate_flight(
     outcome: str,
     title: str,
     form: str = ".gif",
+    phase: ShowPhase = show_nothing,
 ) -> bytes:
     """Returns a flight as an animated GIF of `SIZE`, which repeats for ever, or as an MP4 (H.264) of that size.
 
@@ -70,6 +72,7 @@ def animate_flight(
         outcome: how the flight ended, a key of `OUTCOME_LABELS`.
         title: stands above the world.
         form: `.gif` or `.mp4`, which needs the extra `video`.
+        phase: called after each frame.
 
     Raises:
         MissingPackageError: if the extra is not installed.
@@ -80,8 +83,12 @@ def animate_flight(
     speed_up = every * sights.config.drone.physics_steps * sights.config.drone.physics_dt_s / FRAME_S
     with matplotlib.rc_context(STYLE):
         stage = _Stage(sights, params, trajectory, f"{title}, {speed_up:.1f} times as fast as flown")
-        frames = [stage.frame(int(number), int(rows[number])) for number in shown]
+        frames = []
+        for number in shown:
+            frames.append(stage.frame(int(number), int(rows[number])))
+            phase("drawing", len(frames), len(shown) + 1)
         frames.append(stage.frame(len(rows) - 1, len(trajectory["t"]) - 1, outcome))
+    phase("writing")
     if form == ".mp4":
         return _mp4(frames + [frames[-1]] * (round(LAST_FRAME_S / FRAME_S) - 1))
     return encode_gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rich.console import Console, Group
@@ -42,8 +42,14 @@ LASTING = ("episodes", "success_rate", "validation_success", "mean_return")
 class Progress:
     """Shows the phases of a run, each with a clock, and the metrics of its training."""
 
-    def __init__(self, console: Console | None = None, every_s: float = 2.0) -> None:
-        """Writes to `console`, or standard output; without a terminal, a line for each phase and each `every_s`."""
+    def __init__(
+        self, console: Console | None = None, every_s: float = 2.0, tell: Callable[[str], None] = lambda _: None
+    ) -> None:
+        """Writes to `console`, or standard output; without a terminal, a line for each phase and each `every_s`.
+
+        `tell` is called with the name of each phase.
+        """
+        self._tell = tell
         self._console = console or Console()
         self._every_s = every_s
         self._live: Live | None = None
@@ -62,6 +68,7 @@ class Progress:
     def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
         """Shows that the phase `name` begins; if it is training, with the decisions in all and those taken before."""
         returning = total == 0 and name == "training"  # from a validation
+        self._tell(name)
         self._phase, self._phase_started = name, time.monotonic()
         self._total = total or self._total
         if total:
@@ -77,6 +84,7 @@ class Progress:
         lasting = {key: self._metrics[key] for key in LASTING if key in self._metrics}
         self._metrics = lasting | {key: value for key, value in metrics.items() if value is not None}
         self._phase = str(metrics.get("phase", self._phase))
+        self._tell(self._phase)
         now = time.monotonic()
         self._measure(now)
         if self._live is None and now - self._printed >= self._every_s:

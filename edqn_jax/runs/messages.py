@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
 from typing import Any
 
 from edqn_jax.config import FAMILIES, Config
@@ -40,19 +42,48 @@ def describe_stop(run: RunDirectory | None, decisions: int, seeds: int | None) -
     what = "the policy" if seeds is None else "the policies"
     if run is None:
         where = f"the first process saves {what}"
-    elif seeds is None:
-        where = f"the policy is in '{run.checkpoints}'"
     else:
-        where = f"the policies are in '{run.path}'"
+        where = f"the policy is in '{run.checkpoints}'" if seeds is None else f"the policies are in '{run.path}'"
+        where += f"; {_train_command(run.path)} goes on from there"
     return f"stopped after {decisions:,} decisions; {where}"
 
 
-def verdict(summary: dict[str, Any], run: RunDirectory) -> str:
-    """Returns the last lines on the screen, of one agent's run or of several seeds."""
-    return (_of_seeds(summary) if "seeds" in summary else _of_one(summary)) + f" {run.path}"
+def verdict(summary: dict[str, Any], run: RunDirectory, config: Config) -> str:
+    """Returns the last lines on the screen, of one agent's run or of several seeds, with what may come next.
+
+    Args:
+        summary: content of `summary.json`.
+        run: which was written.
+        config: of the run.
+    """
+    text = _of_seeds(summary) if "seeds" in summary else _of_one(summary, config)
+    return f"{text} {run.path}\n{_next_commands(summary, run, config)}"
 
 
-def _of_one(summary: dict[str, Any]) -> str:
+def _next_commands(summary: dict[str, Any], run: RunDirectory, config: Config) -> str:
+    """Returns the commands that show a run, fly it and go on with it, a line each."""
+    flies = run.of_seed(summary["seeds"][0]).path if "seeds" in summary else run.path
+    more = 2 * config.train.total_steps
+    return "\n".join(
+        (
+            f"see it:       edqn report {_word(run.path)}",
+            f"fly it:       edqn evaluate {_word(flies)} --missions 100",
+            f"train longer: {_train_command(run.path)} --total-steps {more}",
+        )
+    )
+
+
+def _train_command(folder: Path) -> str:
+    """Returns the command that goes on with the run in a folder, whose options are its own."""
+    return f"edqn train --run-dir {_word(folder)}"
+
+
+def _word(path: Path) -> str:
+    """Returns a path as a word of a shell."""
+    return shlex.quote(str(path))
+
+
+def _of_one(summary: dict[str, Any], config: Config) -> str:
     ending = {
         "goal": "reached the goal",
         "collision": "ended in a collision",
@@ -61,6 +92,8 @@ def _of_one(summary: dict[str, Any]) -> str:
         "diverged": "diverged",
     }[summary["outcome"]]
     text = (
+        f"Validation: {summary['validation_success']:.0%} of {_count(config.train.validation_missions, 'mission')} "
+        f"reached the goal, after {_count(summary['parameters_from_decisions'], 'decision')} of training.\n"
         f"{_flight(summary)} {ending} after {_count(summary['steps'], 'decision')} "
         f"({summary['flight_seconds']:.1f} s): {summary['path_length_m']:.1f} m flown, "
         f"shortest path {summary['shortest_path_m']:.1f} m. "

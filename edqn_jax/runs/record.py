@@ -108,7 +108,7 @@ def train_run(
             if seeds is not None:
                 run.write_summary(summary)
             progress.stop()
-            progress.message(messages.verdict(summary, run))
+            progress.message(messages.verdict(summary, run, config))
     return summary
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.cli import commands, main, train
+from edqn_jax.cli.arguments import MEANINGS, flags_of
 from edqn_jax.cli.evaluate import EvaluateArgs, parse_evaluate
 from edqn_jax.cli.help import COMMON, NAMED, flag_of
 from edqn_jax.cli.train import parse_train, train_flags
@@ -170,13 +171,21 @@ def test_every_kind_of_option_can_be_a_flag():
             "there is no set of actions 'move'; did you mean 'moves'?",
         ),
         (["train", "--agent.bach-size", "64"], "--agent.batch-size"),
-        (["train", "--train.num-envs", "many"], "--train.num-envs"),
+        (["train", "--train.num-envs", "many"], "--train.num-envs must be a whole number, not 'many'"),
+        (["train", "--events.threshold", "x"], "--events.threshold must be a number, not 'x'"),
+        (["train", "--agent.hidden", "a", "b"], "--agent.hidden must be whole numbers, not 'a b'"),
+        (["train", "--seeds", "many"], "--seeds must be a whole number, not 'many'"),
+        (["train", "--agent.double", "yes"], "'yes' is a word too many; 'edqn train --help' lists what there is"),
+        (["evaluate", "pretrained", "--start", "1", "2"], "--start must be X Y Z, not '1 2'"),
+        (["evaluate", "pretrained", "--missions"], "--missions must be followed by a value"),
+        (["record"], "'edqn record' needs POLICY and FILE; see 'edqn record --help'"),
+        (["completion", "csh"], "shell cannot be 'csh'"),
         (["train", "--seeds", "0"], "--seeds must be at least 1, not 0"),
-        (["train", "--preset", "best"], "invalid choice 'best'"),
-        (["train", "--events.law", "esmi"], "invalid choice 'esmi'"),
+        (["train", "--preset", "best"], "--preset cannot be 'best'; known are default, paper"),
+        (["train", "--events.law", "esmi"], "--events.law cannot be 'esmi'; did you mean 'esim'?"),
         (["train", "--config", "nowhere.yaml"], "nowhere.yaml"),
         (["train", "--resume", "must"], "--resume must needs --run-dir"),
-        (["evaluate"], "POLICY"),
+        (["evaluate"], "'edqn evaluate' needs POLICY; see"),
         (["evaluate", "nowhere"], "there is no run in 'nowhere'"),
         (["quux"], "there is no command 'quux'; known are train, evaluate"),
         (["trian"], "did you mean 'train'?"),
@@ -190,7 +199,8 @@ def test_every_kind_of_option_can_be_a_flag():
 )
 def test_bad_input_ends_with_2_a_sentence_and_nothing_made(argv, says, capsys, tmp_path, trainer):
     assert main(argv) == 2
-    assert says in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert said.err.startswith("edqn: ") and says in said.err and said.err.count("\n") == 1 and not said.out
     assert list(tmp_path.iterdir()) == []
     assert trainer.calls == []
 
@@ -381,6 +391,14 @@ def test_what_the_short_help_shows_is_an_option(name):
         ("--camera.widht", "--camera.width"),
         ("--total_step", "--total-steps"),
         ("--lr", "--agent.learning-rate"),
+        ("--agent.lr", "--agent.learning-rate"),
+        ("--agent.gamma", "--agent.discount"),
+        ("--gamma", "--agent.discount"),
+        ("--envs", "--num-envs"),
+        ("--train.envs", "--train.num-envs"),
+        ("--steps", "--total-steps"),
+        ("--batch", "--agent.batch-size"),
+        ("--encoder.batch", "--encoder.batch-size"),
         ("--encoder.lr", "--encoder.learning-rate"),
         ("--qx", None),
     ],
@@ -389,6 +407,11 @@ def test_a_flag_that_is_short_or_wrong_leads_to_the_one_that_was_meant(flag, mea
     says = f"did you mean '{meant}'" if meant else "'edqn train --help-all' lists what there is"
     with pytest.raises(ConfigError, match=re.escape(says)):
         parse_train([flag, "3"])
+
+
+@pytest.mark.parametrize("meant", sorted(set(MEANINGS.values())))
+def test_what_people_mean_is_an_option(meant):
+    assert any(re.fullmatch(rf"--(\w+\.)?{meant}", flag) for flag in train_flags() | flags_of(EvaluateArgs))
 
 
 def test_the_versions_are_those_of_the_packages():
@@ -455,7 +478,9 @@ def test_train_py_is_the_train_command():
         check=False,
     )
     assert shown.returncode == 2
-    assert shown.stderr == "edqn: train.num_envs must be at least 1, not 0\n"
+    *phases, said = shown.stderr.splitlines()
+    assert phases and all(line.startswith("edqn train: starting") for line in phases)
+    assert said == "edqn: train.num_envs must be at least 1, not 0"
 
 
 def test_a_reader_that_has_enough_is_no_error() -> None:

@@ -12,7 +12,7 @@ import pytest
 from edqn_jax.config import Config
 from edqn_jax.config.simulation import WorldConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.world_check import (
     MARGIN_M,
     check_world,
@@ -185,6 +185,16 @@ def test_an_evaluation_and_a_training_warn_as_the_check_does(tmp_path: Path) -> 
     assert warn_of_missions(ROOMS, load_missions(ROOMS, "rooms")) == () == warn_of_training(ROOMS)
     assert warn_of_training(dataclasses.replace(ROOMS, world=WorldConfig(name=str(tmp_path / "gone.xml")))) == ()
     assert warn_of_missions(there, load_missions(there, str(corridor(tmp_path, WIDE)))) == ()
+
+
+def test_random_worlds_much_larger_than_those_of_training_are_warned_of() -> None:
+    (warning,) = warn_of_missions(ROOMS, MissionSet("medium", None, None))  # type: ignore[arg-type]
+    assert (
+        warning.startswith("the flight volume of 110 × 110 × 25 m is much larger than those") and "36 × 36" in warning
+    )
+    larger = dataclasses.replace(ROOMS, world=WorldConfig(name="mixed"))
+    assert warn_of_training(larger, ROOMS) == (warning,)
+    assert warn_of_training(ROOMS, larger) == () == warn_of_training(larger)
 
 
 def test_costs_grow_with_shapes_and_pixels(tmp_path: Path) -> None:

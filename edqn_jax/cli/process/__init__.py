@@ -1,1 +1,1 @@
-"""The process of a command: signals, output that cannot be written, environment variables."""
+"""The process of a command: signals, output, its status, arguments that do not parse, environment variables."""

@@ -109,6 +109,8 @@ def _end(number: int) -> NoReturn:
     whole_files.acquire(timeout=_WAITS_S)
     if sys.stdout.isatty():
         os.write(sys.stdout.fileno(), b"\x1b[?25h\n")  # a live display hides the cursor
+    elif sys.stderr.isatty():
+        os.write(2, b"\n")  # after the line of the status
     with contextlib.suppress(OSError):
         os.write(2, f"edqn: {_NAMES[signal.Signals(number)]}\n".encode())
     os._exit(128 + number)

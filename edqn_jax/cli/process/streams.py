@@ -13,6 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from typing import Protocol
 
 NOBODY_READS = (errno.EPIPE, errno.EIO)
 """Errors of writing to a closed pipe or terminal, which are ignored."""
@@ -24,6 +25,13 @@ _RETRY_S = 0.01
 """Between attempts to write to a pipe that is full and does not block."""
 
 
+class Watch(Protocol):
+    """What is told before something is written."""
+
+    def __call__(self, data: bytes, *, is_terminal: bool) -> None:
+        """Takes what is about to be written, and whether to a terminal."""
+
+
 class Lasting(io.FileIO):
     """A descriptor to which writing never fails: after the first failure everything is dropped."""
 
@@ -31,12 +39,20 @@ class Lasting(io.FileIO):
         """Writes to the descriptor, which stays open."""
         super().__init__(descriptor, "w", closefd=False)
         self.failure: OSError | None = None
+        self._watch: Watch | None = None
+        self._is_terminal = self.isatty()
+
+    def watch(self, watch: Watch) -> None:
+        """Has `watch` called before each write."""
+        self._watch = watch
 
     def write(self, data) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Writes, or drops, all or a part of `data`; returns how many bytes."""
         size = memoryview(data).nbytes
         if self.failure is not None:
             return size
+        if self._watch is not None:
+            self._watch(bytes(data), is_terminal=self._is_terminal)
         try:
             while (written := super().write(data)) is None:
                 time.sleep(_RETRY_S)

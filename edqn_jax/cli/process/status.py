@@ -1,0 +1,176 @@
+"""What a command is doing, on standard error, from its first moment on: a line that ticks, or one now and then.
+
+A terminal has one line that is drawn anew four times a second and is gone once something else is printed. Elsewhere,
+as in a log, a line stands at the beginning, and another after every ten seconds in which nothing was printed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+
+from edqn_jax.cli.process.streams import Lasting
+
+TICK_S = 0.25
+"""Between two drawings of the line on a terminal."""
+
+SILENT_S = 10.0
+"""Longest time without a line elsewhere."""
+
+_CLEARED = b"\r\x1b[K"
+
+
+class Status:
+    """The phase of a command and its clock."""
+
+    def __init__(self, title: str, descriptor: int, *, lives: bool) -> None:
+        """Shows nothing before `start`.
+
+        Args:
+            title: what each line begins with.
+            descriptor: to write to.
+            lives: whether one line is drawn over and over, as a terminal can.
+        """
+        self._title, self._descriptor, self._lives = title, descriptor, lives
+        self._lock, self._ended = threading.RLock(), threading.Event()
+        self._began = self._phase_began = self._printed = time.monotonic()
+        self._name, self._done, self._total = "starting", 0, 0
+        self._is_shown, self._is_at_start = False, True  # of a line on the terminal
+
+    def start(self) -> None:
+        """Shows the first line and goes on until `stop`."""
+        self._show()
+        threading.Thread(target=self._tick, name="status", daemon=True).start()
+
+    def stop(self) -> None:
+        """Clears the line; nothing is shown any more."""
+        with self._lock:
+            self._ended.set()
+            self._clear()
+
+    def phase(self, name: str, done: int = 0, total: int = 0) -> None:
+        """Begins a phase, or says how much of it is done, of how much."""
+        with self._lock:
+            if name != self._name:
+                self._name, self._phase_began = name, time.monotonic()
+            self._done, self._total = done, total
+
+    def make_way(self, data: bytes, *, is_terminal: bool) -> None:
+        """Clears the line before something else is printed: `data`, to a terminal or elsewhere."""
+        with self._lock:
+            self._printed = time.monotonic()
+            if is_terminal:
+                self._clear()
+                self._is_at_start = data.endswith(b"\n")
+
+    def line(self, now: float) -> str:
+        """Returns the line at a time of `time.monotonic`."""
+        took = now - self._phase_began
+        parts = [f"{self._title}: {self._name}"]
+        if self._total:
+            parts.append(f"{self._done:,} of {self._total:,}")
+        parts.append(_clock(took))
+        if 0 < self._done < self._total:
+            parts.append(f"about {_clock(took / self._done * (self._total - self._done))} left")
+        if now - self._began > took + 1.0:
+            parts.append(f"{_clock(now - self._began)} in all")
+        return ", ".join(parts)
+
+    def _tick(self) -> None:
+        while not self._ended.wait(TICK_S):
+            with self._lock:
+                silent = time.monotonic() - self._printed >= SILENT_S
+                if not self._ended.is_set() and (self._is_at_start if self._lives else silent):
+                    self._show()
+
+    def _show(self) -> None:
+        now = time.monotonic()
+        text = self.line(now)
+        if self._lives:
+            columns = shutil.get_terminal_size().columns
+            self._write(_CLEARED + text[: columns - 1].encode("ascii", "replace"))
+            self._is_shown = True
+        else:
+            self._write(f"{text}\n".encode("ascii", "replace"))
+            self._printed = now
+
+    def _clear(self) -> None:
+        if self._is_shown:
+            self._write(_CLEARED)
+            self._is_shown = False
+
+    def _write(self, data: bytes) -> None:
+        with contextlib.suppress(OSError):
+            os.write(self._descriptor, data)
+
+
+_shown: list[Status] = []
+"""The status of this process' command, if it shows one."""
+
+
+def show_phase(name: str, done: int = 0, total: int = 0) -> None:
+    """Shows that a phase begins, or how much of it is done; does nothing outside of a command."""
+    for status in _shown:
+        status.phase(name, done, total)
+
+
+def say_phase(name: str) -> None:
+    """Prints the name of a phase that begins, as a line that stays, and shows its clock."""
+    print(name, flush=True)
+    show_phase(name)
+
+
+def end_status() -> None:
+    """Shows nothing any more, because something else does."""
+    while _shown:
+        _shown.pop().stop()
+
+
+@contextlib.contextmanager
+def shown_status(argv: Sequence[str], outputs: Sequence[Lasting]) -> Iterator[None]:
+    """Shows within the block what the command of these words does.
+
+    Nothing is shown where standard error is closed or another program's, nor, but on a terminal, before what is there
+    at once: a help, versions or a script.
+
+    Args:
+        argv: words of the command.
+        outputs: of `lasting_streams`; the line makes way for what is written to them.
+    """
+    error = next((output for output in outputs if output.fileno() == 2), None)
+    if error is None:
+        yield
+        return
+    lives = error.isatty() and os.environ.get("TERM") not in (None, "", "dumb")
+    command = _command_of(argv)
+    if not lives and (command in ("", "completion") or {"-h", "--help", "--help-all", "--version"} & set(argv)):
+        yield
+        return
+    sys.stderr.flush()
+    status = Status(f"edqn {command}".rstrip(), error.fileno(), lives=lives)
+    for output in outputs:
+        output.watch(status.make_way)
+    _shown.append(status)
+    status.start()
+    try:
+        yield
+    finally:
+        end_status()
+
+
+def _command_of(argv: Sequence[str]) -> str:
+    """Returns the command among its words, or nothing; what is imported may stand before it."""
+    words = [word for before, word in zip(("", *argv), argv, strict=False) if before != "--import"]
+    command = next((word for word in words if not word.startswith("-")), "")
+    return command if command.isidentifier() else ""
+
+
+def _clock(seconds: float) -> str:
+    """Returns `m:ss`, without the packages that `evaluation.metrics.format_duration` takes seconds to import."""
+    minutes, rest = divmod(int(seconds), 60)
+    return f"{minutes}:{rest:02}"

@@ -1,0 +1,37 @@
+"""What a policy was not trained with is one sentence each."""
+
+from __future__ import annotations
+
+import pytest
+
+from edqn_jax.config.loading import make_config
+from edqn_jax.policies.unseen import describe_unseen
+
+TRAINED = make_config("medium", surface={"pattern": "plaid"})
+MANY = make_config("medium", surface={"pattern": "drawn"})
+
+
+@pytest.mark.parametrize(
+    ("trained", "options", "says"),
+    [
+        (TRAINED, {}, []),
+        (MANY, {"surface": {"pattern": "bricks"}}, []),
+        (TRAINED, {"air": {"gusts_m_s": 5.0}}, []),
+        (
+            TRAINED,
+            {"surface": {"pattern": "bricks"}},
+            ["trained with surface.pattern plaid alone; with bricks it sees"],
+        ),
+        (TRAINED, {"env": {"speed_m_s": 8.0}}, ["trained with env.speed_m_s 4.0, not 8.0: how it flies so"]),
+        (
+            TRAINED,
+            {"camera": {"horizontal_fov_deg": 60.0, "mount": "body"}, "env": {"speed_m_s": 2.0}},
+            ["env.speed_m_s 4.0, not 2.0", "camera.horizontal_fov_deg 90.0, camera.mount level, not 60.0, body: how"],
+        ),
+    ],
+)
+def test_each_difference_that_matters_is_a_sentence_and_nothing_else_is(trained, options, says):
+    found = describe_unseen(
+        trained, make_config("medium", **{"surface": {"pattern": trained.surface.pattern}, **options})
+    )
+    assert len(found) == len(says) and all(each in line for each, line in zip(says, found, strict=True))
