@@ -245,7 +245,7 @@ def test_a_velocity_that_may_jump_is_flown_as_without_an_autopilot_and_a_slow_on
     # 0.52 s of 4 m/s^2, less what the drone lags behind: one time constant of its controller and some of its attitude
     late = float(flown_disturbed(config, slow, (4, 0, 0), 2)[0].velocity[0])
     assert 0.8 < late < 2.08 < free[0]
-    held = flown_disturbed(config, slow, (4, 0, 0), 2)[1].held
+    held: Any = flown_disturbed(config, slow, (4, 0, 0), 2)[1].held
     np.testing.assert_allclose(held, [2.08, 0, 0], atol=1e-4)
 
 

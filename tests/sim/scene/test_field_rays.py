@@ -67,7 +67,7 @@ def test_the_constants_in_c_are_those_of_python() -> None:
     names = {"FAR": "FAR_M"}
     assert len(found) == 8
     for name, value in found:
-        assert float(value) == (TINY if name == "TINY" else getattr(field_rays, names.get(name, name)))
+        assert float(value) == (TINY if name == "TINY" else getattr(field_rays, names.get(name) or name))
 
 
 def test_c_meets_what_jax_meets_and_mujoco(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
