@@ -219,6 +219,7 @@ def test_learning_shows_each_metric_where_a_line_has_it(tmp_path):
     metrics += [{"decisions": 900, "validation_success": 0.75}, {"decisions": 950, "q_loss": None}]
     figure = plot_learning(metrics, tmp_path / "learning.png")
     assert is_png(tmp_path / "learning.png")
+    assert [text.get_text() for text in figure.axes[0].texts] == ["75.0%"]  # the last validation
     lines = {line.get_gid(): line for axes in figure.axes for line in axes.get_lines()}
     points = {str(name): len(np.asarray(line.get_xdata())) for name, line in lines.items()}
     assert points == {
@@ -300,6 +301,10 @@ def test_nearness_is_drawn_below_the_events_that_it_was_told_from(tmp_path):
     for row, expected in enumerate((counts, near, near * 0.75)):
         np.testing.assert_array_equal(np.stack(pictures[2 * row : 2 * row + 2]), expected)
     assert [axes.get_ylabel() for axes in figure.axes[:6:2]] == ["events", "true nearness, blurred", "from the code"]
+    bar = figure.axes[-1]
+    assert bar.get_ylabel() == "distance, bright is near"
+    ticks = dict(zip((text.get_text() for text in bar.get_yticklabels()), bar.get_yticks(), strict=True))
+    assert ticks["4 m"] == pytest.approx(1.5)  # half of what contact has
     assert {axes.images[0].get_clim() for axes in figure.axes[2:6]} == {(0.5, 2.0)}
 
 
