@@ -175,7 +175,7 @@ class _Stage:
     def frame(self, row: int, outcome: str = "") -> Image.Image:
         """Returns the picture of a row of the trajectory, with the path so far and what was sensed last."""
         decision = max(int(np.searchsorted(self._seen, row, side="right")) - 1, 0)
-        seen_at = min(row, int(self._seen[-1]))
+        seen_at = np.minimum(row, self._seen[-1])
         self._rgb.set_data(
             on_screen(
                 self._sights.rgb(*trajectory_poses(self._trajectory, seen_at), times_of(self._trajectory, seen_at))

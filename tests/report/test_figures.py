@@ -161,7 +161,8 @@ def test_the_path_is_drawn_whole_in_both_views(tmp_path):
     assert "shortest path" in texts(figure)
     shortest = np.asarray(figure.axes[2].get_lines()[0].get_xydata())
     np.testing.assert_allclose(shortest, [[0, 3], [np.hypot(89 * 2**0.5, 7), 10]])
-    (height,) = (c for c in figure.axes[2].collections if c.get_array() is not None and len(c.get_segments()))
+    lines = [line for line in figure.axes[2].collections if isinstance(line, LineCollection)]
+    (height,) = (line for line in lines if line.get_array() is not None and len(line.get_segments()))
     np.testing.assert_allclose(height.get_segments()[-1][-1], [np.hypot(88 * 2**0.5, 7), 10])
     assert figure.axes[2].get_ylabel() == "altitude, m"
 
