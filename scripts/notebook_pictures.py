@@ -17,7 +17,7 @@ from PIL import Image
 FOLDER = Path(__file__).parents[1] / "docs" / "images" / "notebooks"
 SHOWN = {1: 1, 2: 1, 3: 1, 4: 1, 5: 1, 6: 0, 7: 0}
 """Which of its pictures stands for a notebook, by the notebook's number."""
-WIDTH, COLOURS = 820, 96
+WIDTH = 820
 
 
 def pictures_of(file: Path) -> list[Image.Image]:
@@ -36,7 +36,7 @@ def write_picture(file: Path, folder: Path = FOLDER) -> Path | None:
     picture.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
     folder.mkdir(parents=True, exist_ok=True)
     written = folder / f"{number}.png"
-    picture.quantize(COLOURS, dither=Image.Dither.NONE).save(written, optimize=True)
+    picture.save(written, optimize=True)  # a palette would merge the colours of outcomes
     return written
 
 
