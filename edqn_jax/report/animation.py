@@ -98,7 +98,8 @@ def animate_flight(
     if len(shown) * film.size[0] * film.size[1] > MOST_PIXELS:
         raise ConfigError(f"the video would have {len(shown)} frames, too many of its size; choose a higher speed")
     with matplotlib.rc_context(STYLE):
-        stage = _Stage(sights, params, trajectory, f"{title}, {speed:.3g} times as fast as flown", film.size)
+        pace = "as fast as flown" if speed == 1 else f"{speed:.3g} times as fast as flown"
+        stage = _Stage(sights, params, trajectory, f"{title}, {pace}", film.size)
         frames = [stage.frame(int(row)) for row in shown]
         frames.append(stage.frame(len(trajectory["t"]) - 1, outcome))
     if form == ".mp4":

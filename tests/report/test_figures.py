@@ -101,7 +101,7 @@ def test_a_ceiling_and_the_walls_before_the_eye_are_cut_away():
     oblique, above = make_cutaway(hall, OBLIQUE), make_cutaway(hall, MAP)
     assert (len(oblique.shown), len(oblique.near_walls), oblique.note) == (3, 2, "ceiling and near walls cut away")
     assert (len(above.shown), len(above.near_walls)) == (4, 0)  # the box can be flown over
-    assert above.note == "ceiling cut away; pale: open above or below"
+    assert above.note == "ceiling cut away; open is pale"
 
 
 def test_nothing_is_cut_away_in_the_open():

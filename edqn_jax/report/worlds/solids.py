@@ -166,7 +166,7 @@ class CutawayView:
         """Note on what was cut away, for the figure; empty if nothing was."""
         parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", self.near_walls)) if cut]
         notes = [f"{' and '.join(parts)} cut away"] if parts else []
-        notes += ["pale: open above or below"] if self.passable else []
+        notes += ["open is pale"] if self.passable else []
         notes += [] if self.cut is None else [f"cut off above {self.cut:.1f} m"]
         return "; ".join(notes + (["outlined: what moves, as at the start"] if self.moving else []))
 
