@@ -13,6 +13,9 @@ from edqn_jax.errors import ConfigError
 VIDEO, EVENT_FILES = (".gif", ".mp4"), (".h5", ".hdf5", ".npz", ".txt")
 """Endings of the files of one flight that `edqn record` writes."""
 
+SMALLEST = 200
+"""Pixels across and down of the smallest video."""
+
 whole_files = threading.Lock()
 """Lock held during atomic writes."""
 
@@ -74,3 +77,22 @@ def _check_can_make(path: Path, there: Path, name: str = "") -> None:
         os.rmdir(tempfile.mkdtemp(prefix=name, dir=there))
     except OSError as error:
         raise write_error(path, f"nothing can be created in '{there}' ({error.strerror or 'unknown reason'})") from None
+
+
+def check_shown(file: Path, size: tuple[int, int] | None, speed: float | None, fps: float | None) -> None:
+    """Checks size, speed and frames a second of a video, or the size of a camera of events.
+
+    Raises:
+        ConfigError: if one is out of range, or does not belong to such a file.
+    """
+    suffix = file.suffix.lower()
+    least = SMALLEST if suffix in VIDEO else 1
+    if size is not None and min(size) < least:
+        raise ConfigError(f"--size must be two whole numbers of at least {least}, not {size[0]} {size[1]}")
+    if size is not None and suffix == ".mp4" and (size[0] % 2 or size[1] % 2):
+        raise ConfigError(f"--size of an .mp4 must be even, not {size[0]} {size[1]}")
+    for name, value, most in (("--speed", speed, 100), ("--fps", fps, 50 if suffix == ".gif" else 120)):
+        if value is not None and suffix not in VIDEO:
+            raise ConfigError(f"{name} is only for videos, and '{file}' is a file of events")
+        if value is not None and not 0.01 <= value <= most:
+            raise ConfigError(f"{name} must be from 0.01 to {most}, not {value:g}")

@@ -14,7 +14,7 @@ from edqn_jax.cli.arguments import Point, check_run, parse_arguments, print_note
 from edqn_jax.cli.help import RECORD
 from edqn_jax.cli.process.status import show_phase
 from edqn_jax.errors import ConfigError
-from edqn_jax.files import EVENT_FILES, VIDEO
+from edqn_jax.files import EVENT_FILES, VIDEO, check_shown
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,12 @@ class RecordArgs:
     """What to write; it replaces a file of that name. FILE.gif or .mp4 (extra `video`): the view, what the drone sees,
     and its path. FILE.h5, .npz or .txt (extra `events`): the events of a camera with a frame at every physics step."""
     size: Annotated[tuple[int, int] | None, arg(metavar="W H", help_behavior_hint="")] = None
-    """Pixels across and down of the camera whose events are written (default: those of the policy's)."""
+    """Pixels across and down: of a video (default: 800 540), or of the camera whose events are written (default: those
+    of the policy's)."""
+    speed: Annotated[float | None, arg(metavar="TIMES", help_behavior_hint="")] = None
+    """How many times as fast as flown a video is; 1 is as flown (default: a frame a decision, at most 120)."""
+    fps: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Frames a second of a video (default: 10)."""
     world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
     """Where to fly: `paper`, an MJCF file, or a family of random worlds (default: that of the run's last flight)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
@@ -50,10 +55,7 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
     suffix = args.file.suffix.lower()
     if suffix not in VIDEO + EVENT_FILES:
         raise ConfigError(f"'{args.file}' must end in .gif or .mp4 for a video, or in .h5, .npz or .txt for events")
-    if args.size is not None and suffix in VIDEO:
-        raise ConfigError(f"--size is only for files of events, and '{args.file}' is a video")
-    if args.size is not None and min(args.size) < 1:
-        raise ConfigError(f"--size must be two whole numbers of at least 1, not {args.size[0]} {args.size[1]}")
+    check_shown(args.file, args.size, args.speed, args.fps)
     if suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ConfigError("an .mp4 needs imageio_ffmpeg; run pip install 'edqn-jax[video]', or write a .gif")
     check_run(args.run)
@@ -74,8 +76,17 @@ def record_command(args: RecordArgs) -> None:
     from edqn_jax.runs.policies import find_policy
 
     policy = find_policy(args.run, args.world)
-    where = {"start": args.start, "goal": args.goal}
-    done = record(policy, args.file, args.world, **where, seed=args.seed, size=args.size, phase=show_phase)
+    done = record(
+        policy,
+        args.file,
+        args.world,
+        start=args.start,
+        goal=args.goal,
+        seed=args.seed,
+        size=args.size,
+        pace=(args.speed, args.fps),
+        phase=show_phase,
+    )
     print_notes(args.run, args.world, done.missions.note)
     print(
         f"{OUTCOME_LABELS[done.outcome]} after {done.seconds:.1f} s; '{args.file}' has "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 from edqn_jax.config import Config
 from edqn_jax.devices.jax_settings import as_tested
@@ -14,7 +15,7 @@ from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.places import Point
 from edqn_jax.evaluation.rollouts import ShowPhase, fly_on_all_devices, show_nothing
 from edqn_jax.evaluation.trajectories import flight_trajectory
-from edqn_jax.files import EVENT_FILES, VIDEO, check_can_write, write_atomically
+from edqn_jax.files import EVENT_FILES, VIDEO, check_can_write, check_shown, write_atomically
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import Function, FunctionPolicy, actor_of, as_policy, config_of
 from edqn_jax.sim.task import group
@@ -44,6 +45,7 @@ def record(
     goal: Point | None = None,
     seed: int = 0,
     size: tuple[int, int] | None = None,
+    pace: tuple[float | None, float | None] = (None, None),
     phase: ShowPhase = show_nothing,
 ) -> Recorded:
     """Flies a policy once and writes the flight, in place of a file of that name.
@@ -55,7 +57,10 @@ def record(
         world: `paper`, an MJCF file, or a family of random worlds; None is where a run of it ends.
         start, goal: metres, in place of the world's.
         seed: number of the test world of a family; elsewhere it only changes the sensor's noise.
-        size: pixels across and down of the camera whose events are written; None are the policy's.
+        size: pixels across and down, of a video or of the camera whose events are written; None are 800 x 540 or the
+            policy's.
+        pace: of a video: how many times as fast as flown it is (None: a frame a decision, or fewer), and its frames a
+            second (None: 10).
         phase: called as each phase begins, and after each frame that is drawn.
 
     Raises:
@@ -66,8 +71,7 @@ def record(
     suffix = file.suffix.lower()
     if suffix not in VIDEO + EVENT_FILES:
         raise ConfigError(f"'{file}' must end in .gif or .mp4 for a video, or in .h5, .npz or .txt for events")
-    if size is not None and (suffix in VIDEO or min(size) < 1):
-        raise ConfigError(f"size must be two whole numbers of at least 1, of a file of events, not {size}")
+    check_shown(file, size, *pace)
     check_can_write(file)
     policy = as_policy(policy, world)
     config = config_of(policy)
@@ -76,16 +80,24 @@ def record(
     phase("preparing the world")
     missions = load_missions(config, str(world or own), config.env.drones, seed, start, goal)
     if suffix in VIDEO:
-        flights = _write_video(file, policy, config, missions, seed, phase)
+        given = {"size": size, "speed": pace[0], "fps": pace[1]}
+        film = {name: value for name, value in given.items() if value is not None}
+        flights = _write_video(file, policy, config, missions, seed, phase, **film)
     else:
         flights = _write_events(file, policy, config, missions, seed, size, phase)
     return Recorded(_ending(flights), float(flights.flight_seconds[0]), missions)
 
 
 def _write_video(
-    file: Path, policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int, phase: ShowPhase
+    file: Path,
+    policy: Policy | FunctionPolicy,
+    config: Config,
+    missions: MissionSet,
+    seed: int,
+    phase: ShowPhase,
+    **film: Any,
 ) -> Flights:
-    from edqn_jax.report.animation import animate_flight
+    from edqn_jax.report.animation import Film, animate_flight
     from edqn_jax.report.sights import FlightRenderer
 
     scene = scene_of_flight(config, missions)
@@ -97,7 +109,7 @@ def _write_video(
         name = missions.name if missions.file is None else Path(missions.name).stem
         flight, ended = flight_trajectory(config, flights), _ending(flights)
         title, form = f"world '{name}'", file.suffix.lower()
-        video = animate_flight(sights, policy.params, flight, ended, title, form, phase)
+        video = animate_flight(sights, policy.params, flight, ended, title, form, Film(**film), phase)
     write_atomically(file, video)
     return flights
 

@@ -20,6 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from PIL import Image
 
+from edqn_jax.config import DroneConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.decoder import NEAR_M
 from edqn_jax.evaluation.rollouts import ShowPhase, show_nothing
 from edqn_jax.evaluation.trajectories import POSITION, columns_of
@@ -34,13 +36,15 @@ from edqn_jax.sim.camera.camera import on_screen
 from edqn_jax.sim.scene.scene import has_motion
 
 SIZE = (800, 540)
-"""Width and height of the GIF, pixels."""
-FRAME_S = 0.1
-"""Seconds for which a frame is shown."""
+"""Width and height that a flight is laid out for, pixels."""
+FPS = 10.0
+"""Frames a second."""
 LAST_FRAME_S = 2.5
 """Seconds for which the last frame is shown, with the outcome."""
 MAX_FRAMES = 120
 """Frames of the longest GIF but for the last; a longer flight shows every other decision, or fewer."""
+MOST_PIXELS = 5 * MAX_FRAMES * SIZE[0] * SIZE[1]
+"""Pixels of all frames together at most, which are held in memory."""
 COLOURS = 128
 """Colours of all frames together; more make the file larger and no better to look at."""
 VIVID_COLOURS = 48
@@ -54,6 +58,18 @@ SIGHT_M = 9.0
 """Length of the field of view on the map, metres, in a volume of 100 m; it is as much shorter in a smaller one."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Film:
+    """Pace and size of a video."""
+
+    speed: float | None = None
+    """Times as fast as flown; None shows a decision a frame, or fewer so that there are at most `MAX_FRAMES`."""
+    fps: float = FPS
+    """Frames a second; those of a GIF last whole hundredths of a second."""
+    size: tuple[int, int] = SIZE
+    """Width and height, pixels; what `SIZE` in its proportions leaves is white."""
+
+
 def animate_flight(
     sights: FlightRenderer,
     params: PolicyParams | None,
@@ -61,9 +77,10 @@ def animate_flight(
     outcome: str,
     title: str,
     form: str = ".gif",
+    film: Film = Film(),  # noqa: B008, it is frozen
     phase: ShowPhase = show_nothing,
 ) -> bytes:
-    """Returns a flight as an animated GIF of `SIZE`, which repeats for ever, or as an MP4 (H.264) of that size.
+    """Returns a flight as an animated GIF, which repeats for ever, or as an MP4 (H.264).
 
     Args:
         sights: of the world in which the flight was flown.
@@ -72,26 +89,43 @@ def animate_flight(
         outcome: how the flight ended, a key of `OUTCOME_LABELS`.
         title: stands above the world.
         form: `.gif` or `.mp4`, which needs the extra `video`.
+        film: its pace and size.
         phase: called after each frame.
 
     Raises:
+        ConfigError: if it would have too many frames.
         MissingPackageError: if the extra is not installed.
     """
-    rows = decision_rows(sights.config, trajectory)[:, -1]
-    every = -(-len(rows) // MAX_FRAMES)
-    shown = np.arange(every - 1, len(rows), every)
-    speed_up = every * sights.config.drone.physics_steps * sights.config.drone.physics_dt_s / FRAME_S
+    frame_s = 1 / film.fps if form == ".mp4" else max(round(100 / film.fps), 2) / 100
+    shown, speed = _rows_shown(sights.config.drone, trajectory, film.speed, frame_s)
+    if len(shown) * film.size[0] * film.size[1] > MOST_PIXELS:
+        raise ConfigError(f"the video would have {len(shown)} frames, too many of its size; choose a higher speed")
     with matplotlib.rc_context(STYLE):
-        stage = _Stage(sights, params, trajectory, f"{title}, {speed_up:.1f} times as fast as flown")
+        pace = "as fast as flown" if speed == 1 else f"{speed:.3g} times as fast as flown"
+        stage = _Stage(sights, params, trajectory, f"{title}, {pace}", film.size)
         frames = []
-        for number in shown:
-            frames.append(stage.frame(int(number), int(rows[number])))
+        for row in shown:
+            frames.append(stage.frame(int(row)))
             phase("drawing", len(frames), len(shown) + 1)
-        frames.append(stage.frame(len(rows) - 1, len(trajectory["t"]) - 1, outcome))
+        frames.append(stage.frame(len(trajectory["t"]) - 1, outcome))
     phase("writing")
     if form == ".mp4":
-        return _mp4(frames + [frames[-1]] * (round(LAST_FRAME_S / FRAME_S) - 1))
-    return encode_gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
+        return _mp4(frames + [frames[-1]] * (round(LAST_FRAME_S / frame_s) - 1), film.fps)
+    return encode_gif(frames, [frame_s] * len(shown) + [LAST_FRAME_S])
+
+
+def _rows_shown(
+    drone: DroneConfig, trajectory: Mapping[str, np.ndarray], speed: float | None, frame_s: float
+) -> tuple[np.ndarray, float]:
+    """Returns the rows of a trajectory that frames show, and how many times as fast as flown that is."""
+    steps, count = drone.physics_steps, len(trajectory["t"])
+    if speed is None:
+        decisions = max(count // steps, 1)
+        every = -(-decisions // MAX_FRAMES)
+        shown = np.arange(every, decisions + 1, every) * steps - 1
+        return np.minimum(shown, count - 1), every * steps * drone.physics_dt_s / frame_s
+    pace = speed * frame_s / drone.physics_dt_s  # rows a frame
+    return np.minimum(np.round(np.arange(1, max(int(count / pace), 1) + 1) * pace).astype(int), count) - 1, speed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,11 +151,19 @@ class _Stage:
     """The figure of which all frames are pictures; what moves is drawn over a background that is drawn once."""
 
     def __init__(
-        self, sights: FlightRenderer, params: PolicyParams | None, trajectory: Mapping[str, np.ndarray], title: str
+        self,
+        sights: FlightRenderer,
+        params: PolicyParams | None,
+        trajectory: Mapping[str, np.ndarray],
+        title: str,
+        size: tuple[int, int],
     ) -> None:
-        self._sights, self._trajectory = sights, trajectory
+        self._sights, self._trajectory, self._size = sights, trajectory, size
+        self._seen = decision_rows(sights.config, trajectory)[:, -1]
         self._points = columns_of(trajectory, POSITION)
-        self._figure = Figure(figsize=(SIZE[0] / DOTS_PER_INCH, SIZE[1] / DOTS_PER_INCH), dpi=DOTS_PER_INCH)
+        scale = min(size[0] / SIZE[0], size[1] / SIZE[1])
+        wide, high = (side / DOTS_PER_INCH for side in SIZE)
+        self._figure = Figure(figsize=(wide, high), dpi=DOTS_PER_INCH * scale)
         self._canvas = FigureCanvasAgg(self._figure)
         self._moving: list[Artist] = []
         self._shown = sights.shown(params, trajectory) if sights.has_image else None
@@ -138,9 +180,10 @@ class _Stage:
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
 
-    def frame(self, decision: int, row: int, outcome: str = "") -> Image.Image:
-        """Returns the picture of a decision, with the path up to a row of the trajectory."""
-        seen_at = decision_rows(self._sights.config, self._trajectory)[decision, -1]
+    def frame(self, row: int, outcome: str = "") -> Image.Image:
+        """Returns the picture of a row of the trajectory, with the path so far and what was sensed last."""
+        decision = max(int(np.searchsorted(self._seen, row, side="right")) - 1, 0)
+        seen_at = np.minimum(row, self._seen[-1])
         self._rgb.set_data(
             on_screen(
                 self._sights.rgb(*trajectory_poses(self._trajectory, seen_at), times_of(self._trajectory, seen_at))
@@ -165,7 +208,12 @@ class _Stage:
         self._canvas.restore_region(self._background)
         for artist in sorted(self._moving, key=lambda artist: artist.get_zorder()):
             self._figure.draw_artist(artist)
-        return Image.fromarray(np.asarray(self._canvas.buffer_rgba())[..., :3])
+        picture = Image.fromarray(np.asarray(self._canvas.buffer_rgba())[..., :3])
+        if picture.size == self._size:
+            return picture
+        page = Image.new("RGB", self._size, "white")
+        page.paste(picture, ((self._size[0] - picture.width) // 2, (self._size[1] - picture.height) // 2))
+        return page
 
     def _state(self, row: int) -> str:
         trajectory = self._trajectory
@@ -318,15 +366,15 @@ def encode_gif(frames: list[Image.Image], seconds: list[float], colours: int = C
     return file.getvalue()
 
 
-def _mp4(frames: list[Image.Image]) -> bytes:
-    """Returns the frames, each shown for `FRAME_S`, as an MP4 that browsers and slides play."""
+def _mp4(frames: list[Image.Image], fps: float) -> bytes:
+    """Returns the frames as an MP4 that browsers and slides play."""
     ffmpeg = require_extra("imageio_ffmpeg", extra="video")
     with tempfile.TemporaryDirectory() as folder:  # an MP4 is finished by going back in the file
         file = Path(folder) / "flight.mp4"
         writer = ffmpeg.write_frames(
             str(file),
             frames[0].size,
-            fps=1 / FRAME_S,
+            fps=fps,
             codec="libx264",
             pix_fmt_out="yuv420p",
             macro_block_size=2,

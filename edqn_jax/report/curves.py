@@ -78,6 +78,17 @@ def plot_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
         success = free.pop(0)
         _line(success, metrics, "success_rate", LINE, "training episodes")
         _line(success, metrics, "validation_success", SECOND_LINE, "validation missions, greedy", marker="o")
+        for line in success.get_lines()[-1:]:
+            if line.get_gid() == "validation_success":
+                line.set(lw=1.8, zorder=4)
+                last = np.asarray(line.get_xydata())[-1]
+                said = {
+                    "xytext": (0, -13 if last[1] > 0.2 else 6),
+                    "textcoords": "offset points",
+                    "ha": "right",
+                    "weight": "bold",
+                }
+                success.annotate(f"{last[1]:.1%}", (last[0], last[1]), color=SECOND_LINE, zorder=5, **said)
         success.set_title("Success")
         success.set_ylim(-0.03, 1.03)
         success.yaxis.set_major_formatter(PercentFormatter(1.0))

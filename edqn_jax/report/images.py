@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from edqn_jax.config.registry import SENSORS
 from edqn_jax.evaluation.decoder import NEAR_M, median_error
 from edqn_jax.report.style import COUNTS, INK, POLARITY, frame, open_figure
+from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, HALF_NEAR_M
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,6 +166,11 @@ def _colour_bar(figure: Figure, scale: Normalize, beside: np.ndarray, look: Look
         extend="max" if scale.vmin == 0 else "both",
     )
     bar.set_label(label, color=INK, fontsize=7)
+    if look is NEARNESS:
+        near = {f"{metres} m": DEPTH_SCALE / (1 + metres / HALF_NEAR_M) for metres in (0, 1, 2, 4, 8, 16, 32)}
+        near = {name: value for name, value in near.items() if (scale.vmin or 0) <= value <= (scale.vmax or 0)}
+        bar.set_ticks(list(near.values()), labels=list(near))
+        bar.set_label("distance, bright is near", color=INK, fontsize=7)
     if not look.signed:
         return
     top = int(scale.vmax or 1)

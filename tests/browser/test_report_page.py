@@ -113,6 +113,15 @@ def test_it_draws_the_world_and_what_the_drone_saw(opened: Opened) -> None:
         assert min(ink[3::4]) == 255, number  # every pixel is painted
 
 
+def test_it_opens_where_most_is_seen_and_plays_from_the_start(opened: Opened) -> None:
+    data = json.loads(opened.page.evaluate("document.getElementById('data').textContent"))
+    flight = data["runs"][0]["flights"][0]
+    shown = opened.number("+document.getElementById('time').value")
+    assert shown == pytest.approx((flight["pictures"]["busiest"] + 1) * flight["decision_s"], abs=0.01)
+    opened.page.click("#play")
+    assert opened.number("+document.getElementById('time').value") < shown
+
+
 def test_time_advances_the_flight_and_the_panels_while_it_plays(opened: Opened) -> None:
     panel = "document.querySelectorAll('#panels canvas')[0].toDataURL()"
     before, seen = opened.pixels("#canvas"), opened.page.evaluate(panel)

@@ -1,13 +1,17 @@
-"""The notebooks are stored without outputs, with cell ids that stay, and use the public API alone. CI runs them."""
+"""The notebooks have a picture and no outputs, ids that stay, and use the public API alone. CI runs them."""
 
 from __future__ import annotations
 
 import ast
+import base64
+import io
 import re
+from importlib import import_module
 from pathlib import Path
 
 import nbformat
 import pytest
+from PIL import Image
 
 import edqn_jax
 
@@ -37,6 +41,33 @@ def test_a_notebook_uses_the_public_api_alone(file: Path) -> None:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "edqn_jax"
     }
     assert used and used <= set(edqn_jax.__all__)
+
+
+@pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
+def test_a_notebook_begins_with_a_picture(file: Path) -> None:
+    first = nbformat.read(file, as_version=4).cells[0].source
+    (picture,) = re.findall(r"!\[.{20,}\]\((\S+\.png)\)", first)
+    with Image.open(FOLDER / picture) as shown:
+        assert shown.width >= 400
+
+
+def test_the_picture_of_a_notebook_is_one_of_its_outputs_and_small(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(FOLDER.parent / "scripts"))
+    write_picture = import_module("notebook_pictures").write_picture
+    cell = nbformat.v4.new_code_cell("draw()")
+    for colour in ("red", "blue"):
+        file = io.BytesIO()
+        Image.new("RGB", (1640, 400), colour).save(file, "PNG")
+        data = {"image/png": base64.b64encode(file.getvalue()).decode()}
+        cell.outputs.append(nbformat.v4.new_output("display_data", data=data))
+    notebook = nbformat.v4.new_notebook(cells=[cell])
+    nbformat.write(notebook, tmp_path / "4_name.ipynb")
+    with Image.open(write_picture(tmp_path / "4_name.ipynb", tmp_path)) as written:
+        assert (written.size, written.convert("RGB").getpixel((5, 5))) == ((820, 200), (0, 0, 255))
+    nbformat.write(nbformat.v4.new_notebook(), tmp_path / "5_name.ipynb")
+    assert write_picture(tmp_path / "5_name.ipynb", tmp_path) is None
 
 
 @pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)

@@ -168,8 +168,10 @@ def test_a_damaged_file_and_a_missing_one_are_named(tmp_path, capsys):
 
 
 def test_a_size_is_only_for_events(tmp_path, capsys):
-    assert "only for files of events" in refused(capsys, "record", "pretrained", "a.gif", "--size", 8, 6)
-    assert "only for files of events" in refused(capsys, "record", "pretrained", "a.mp4", "--size", 8, 6)
+    assert "at least 200, not 8 6" in refused(capsys, "record", "pretrained", "a.gif", "--size", 8, 6)
+    assert "must be even" in refused(capsys, "record", "pretrained", "a.mp4", "--size", 801, 540)
+    assert "--speed is only for videos" in refused(capsys, "record", "pretrained", "a.npz", "--speed", 2)
+    assert "--fps must be from 0.01 to 50" in refused(capsys, "record", "pretrained", "a.gif", "--fps", 60)
     assert "at least 1, not 0 5" in refused(capsys, "record", "pretrained", "a.h5", "--size", 0, 5)
     assert "is a folder" in refused(capsys, "events", tmp_path)
     assert "must end in .gif or .mp4 for a video" in refused(capsys, "record", "pretrained", tmp_path / "a.avi")

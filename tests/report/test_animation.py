@@ -15,12 +15,12 @@ from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import flight_files
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
-from edqn_jax.report.animation import LAST_FRAME_S, MAX_FRAMES, SIZE
+from edqn_jax.report.animation import LAST_FRAME_S, MAX_FRAMES, SIZE, Film, _rows_shown
 from edqn_jax.report.sights import SensorImages
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.sim.scene.mjcf import write_scene
-from tests.support.box_flight import SMALL, Drawn, recorded, world_with_a_box
+from tests.support.box_flight import SMALL, Drawn, a_flight, recorded, world_with_a_box
 from tests.support.policies import always
 
 
@@ -45,6 +45,23 @@ def test_there_is_a_frame_for_each_decision_and_one_for_the_end():
 @pytest.mark.slow
 def test_a_long_flight_leaves_decisions_out():
     assert frames(recorded(Drawn(), MAX_FRAMES + 10)) == (MAX_FRAMES + 10) // 2 + 1
+
+
+@pytest.mark.slow
+def test_speed_and_frames_a_second_say_what_frames_show_and_a_size_is_that_of_the_picture():
+    film = Film(speed=2.0, fps=5, size=(640, 360))
+    gif = recorded(Drawn(), 6.4, film=film)  # 83 steps of 0.02 s: 1.66 s, of which a frame shows 0.4 s
+    assert (gif.size, frames(gif), gif.info["duration"]) == ((640, 360), 5, 200)
+    drone = SMALL.drone
+    rows, speed = _rows_shown(drone, a_flight(6.4), 2.0, 0.2)
+    assert rows.tolist() == [19, 39, 59, 79] and speed == 2.0
+    rows, speed = _rows_shown(drone, a_flight(6.4), None, 0.1)
+    assert rows.tolist() == [12, 25, 38, 51, 64, 77] and speed == pytest.approx(2.6)
+
+
+def test_a_video_that_would_not_fit_into_memory_is_refused():
+    with pytest.raises(ConfigError, match="too many of its size"):
+        recorded(Drawn(), 60, film=Film(speed=0.1, fps=50))
 
 
 @pytest.mark.slow

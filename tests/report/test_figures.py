@@ -101,12 +101,24 @@ def test_a_ceiling_and_the_walls_before_the_eye_are_cut_away():
     hall = a_hall(CEILING)
     oblique, above = make_cutaway(hall, OBLIQUE), make_cutaway(hall, MAP)
     assert (len(oblique.shown), len(oblique.near_walls), oblique.note) == (3, 2, "ceiling and near walls cut away")
-    assert (len(above.shown), len(above.near_walls), above.note) == (5, 0, "ceiling cut away")
+    assert (len(above.shown), len(above.near_walls)) == (4, 0)  # the box can be flown over
+    assert above.note == "ceiling cut away; open is pale"
 
 
 def test_nothing_is_cut_away_in_the_open():
     assert make_cutaway(one_of_each_kind(), OBLIQUE).note == make_cutaway(one_of_each_kind(), MAP).note == ""
     assert len(make_cutaway(one_of_each_kind(), OBLIQUE).shown) == 6
+
+
+def test_the_map_of_a_closed_world_shows_a_door_open():
+    beside, over = a_box((10, 5, 3), (0.1, 5, 3)), a_box((10, 12, 5), (0.1, 2, 1))
+    hall = a_hall(CEILING, beside, over)
+    above = make_cutaway(hall, MAP)
+    assert [solid.corners[:, 2].min() for solid in above.passable] == [0.0, 4.0]  # the box, and the wall above the door
+    door = np.array([[10.0, 12, 2]])
+    assert not is_occluded(door, above.shown, MAP)[0]
+    assert is_occluded(np.array([[10.0, 5, 2]]), above.shown, MAP)[0]
+    assert not make_cutaway(hall, OBLIQUE).passable and not make_cutaway(a_hall(beside, over), MAP).passable
 
 
 def test_a_beam_is_no_ceiling():
@@ -148,6 +160,12 @@ def test_the_path_is_drawn_whole_in_both_views(tmp_path):
         assert hidden_part + seen_part == 599
         assert hidden_part > 0
     assert "shortest path" in texts(figure)
+    shortest = np.asarray(figure.axes[2].get_lines()[0].get_xydata())
+    np.testing.assert_allclose(shortest, [[0, 3], [np.hypot(89 * 2**0.5, 7), 10]])
+    lines = [line for line in figure.axes[2].collections if isinstance(line, LineCollection)]
+    (height,) = (line for line in lines if line.get_array() is not None and len(line.get_segments()))
+    np.testing.assert_allclose(height.get_segments()[-1][-1], [np.hypot(88 * 2**0.5, 7), 10])
+    assert figure.axes[2].get_ylabel() == "altitude, m"
 
 
 def test_a_flight_that_fails_says_how(tmp_path):
@@ -203,6 +221,7 @@ def test_learning_shows_each_metric_where_a_line_has_it(tmp_path):
     metrics += [{"decisions": 900, "validation_success": 0.75}, {"decisions": 950, "q_loss": None}]
     figure = plot_learning(metrics, tmp_path / "learning.png")
     assert is_png(tmp_path / "learning.png")
+    assert [text.get_text() for text in figure.axes[0].texts] == ["75.0%"]  # the last validation
     lines = {line.get_gid(): line for axes in figure.axes for line in axes.get_lines()}
     points = {str(name): len(np.asarray(line.get_xdata())) for name, line in lines.items()}
     assert points == {
@@ -284,6 +303,10 @@ def test_nearness_is_drawn_below_the_events_that_it_was_told_from(tmp_path):
     for row, expected in enumerate((counts, near, near * 0.75)):
         np.testing.assert_array_equal(np.stack(pictures[2 * row : 2 * row + 2]), expected)
     assert [axes.get_ylabel() for axes in figure.axes[:6:2]] == ["events", "true nearness, blurred", "from the code"]
+    bar = figure.axes[-1]
+    assert bar.get_ylabel() == "distance, bright is near"
+    ticks = dict(zip((text.get_text() for text in bar.get_yticklabels()), bar.get_yticks(), strict=True))
+    assert ticks["4 m"] == pytest.approx(1.5)  # half of what contact has
     assert {axes.images[0].get_clim() for axes in figure.axes[2:6]} == {(0.5, 2.0)}
 
 

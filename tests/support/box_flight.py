@@ -11,7 +11,7 @@ from PIL import Image
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.report.animation import animate_flight
+from edqn_jax.report.animation import Film, animate_flight
 from edqn_jax.report.sights import FINE, SensorImages
 from edqn_jax.sim.scene.scene import Planes, Scene, UprightBoxes, build_scene
 from tests.support.policies import CONFIG
@@ -48,6 +48,6 @@ def a_flight(decisions: float) -> dict[str, np.ndarray]:
     return {"t": t, "x": t, "z": 0 * t + 4, "qw": 0 * t + 1, "vx": 0 * t + 1} | still
 
 
-def recorded(sights: Any, decisions: float, outcome: str = "goal") -> Image.Image:
-    gif = animate_flight(sights, fresh_policy(SMALL), a_flight(decisions), outcome, title="a box")
+def recorded(sights: Any, decisions: float, outcome: str = "goal", film: Film = Film()) -> Image.Image:  # noqa: B008
+    gif = animate_flight(sights, fresh_policy(SMALL), a_flight(decisions), outcome, title="a box", film=film)
     return Image.open(io.BytesIO(gif))

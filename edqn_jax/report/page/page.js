@@ -153,10 +153,10 @@
       const world = data.worlds[this.world];
       if (!world) return;
       const middle = world.lower.map((low, axis) => (low + world.upper[axis]) / 2);
-      const wide = 0.9 + 0.72 / Math.min(this.camera.aspect, 1.3);
+      const wide = 0.98 + 0.72 / Math.min(this.camera.aspect, 1.3);
       const away = reach(world) * wide;
       this.controls.target.set(middle[0], middle[1] - 0.05 * reach(world), world.lower[2] + 0.25 * (world.upper[2] - world.lower[2]));
-      this.camera.position.set(middle[0] + 0.28 * away, middle[1] - 0.72 * away, world.lower[2] + 0.62 * away);
+      this.camera.position.set(middle[0] + 0.36 * away, middle[1] - 0.68 * away, world.lower[2] + 0.62 * away);  // as in figures
       if (this.mode === "map") this.camera.position.set(middle[0], middle[1] - 0.001 * away, world.upper[2] + 0.95 * away);
       this.controls.update();
     }
@@ -455,7 +455,7 @@
 
   // ------------------------------------------------------------------ the player
 
-  const state = { run: 0, flight: 0, time: 0, playing: false, speed: 1, last: 0 };
+  const state = { run: 0, flight: 0, time: 0, playing: false, speed: 1, last: 0, opening: false };
   let view = null;
   const panels = new Panels(byId("panels"));
   let traces = [];
@@ -472,6 +472,7 @@
     state.run = run;
     state.flight = flight;
     state.time = 0;
+    state.opening = false;
     const of = data.runs[run], here = chosen();
     rowsOf(here);
     byId("run").value = run;
@@ -519,7 +520,16 @@
     }
   }
 
+  /** Shows the moment of the chosen flight in which the drone sees most; playing then begins at the start. */
+  function open() {
+    const { pictures, decision_s: decision } = chosen();
+    if (!pictures) return;
+    seek((pictures.busiest + 1) * decision);
+    state.opening = true;
+  }
+
   function seek(time) {
+    state.opening = false;
     state.time = Math.min(Math.max(time, 0), chosen().end);
     render();
   }
@@ -541,7 +551,8 @@
   }
 
   function play(on) {
-    if (on && state.time >= chosen().end - 1e-3) state.time = 0;
+    if (on && (state.opening || state.time >= chosen().end - 1e-3)) state.time = 0;
+    state.opening = false;
     state.playing = on;
     state.last = performance.now();
     render();
@@ -596,6 +607,7 @@
 
   setView("orbit");
   choose(0, 0);
+  open();
   drawCurves();
   requestAnimationFrame(tick);
 })();

@@ -31,8 +31,9 @@ def flight_pictures(
 ) -> dict[str, Any]:
     """Returns the pictures of a flight as plain JSON data, one frame for each whole decision.
 
-    `width`, `height` of a frame, the number of `frames`, and of each of the `panels` its `name` and `png`, base64:
-    brightness, what the sensor shows, what the decoder draws from the code, and what it should have drawn.
+    `width`, `height` of a frame, the number of `frames`, the `busiest` of them, in which most is seen, and of each of
+    the `panels` its `name` and `png`, base64: brightness, what the sensor shows, what the decoder draws from the code,
+    and what it should have drawn.
 
     Args:
         sights: of the world of the flight; its sensor shows an image.
@@ -51,6 +52,7 @@ def flight_pictures(
         "width": width,
         "height": height,
         "frames": count,
+        "busiest": int(np.argmax(np.abs(shown.image).sum((1, 2)) if look.signed else shown.image.std((1, 2)))),
         "panels": [{"name": name, "png": picture_strip(images, norm, colour)} for name, images, norm, colour in panels],
     }
 
@@ -81,7 +83,8 @@ def _decoder_images(
 def _error_of(shown: SensorImages) -> str:
     """Returns the error of the predicted distances of a flight as the end of a panel's name."""
     assert shown.predicted is not None and shown.distance is not None
-    return f" ({error_caption(shown.predicted, shown.distance)})"
+    # A panel is narrow.
+    return f" ({error_caption(shown.predicted, shown.distance).removeprefix('distance ')})"
 
 
 def picture_strip(images: np.ndarray, norm: Normalize, colours: str | Colormap) -> str:

@@ -26,6 +26,7 @@ from edqn_jax.report.worlds.solids import (
     is_occluded,
     make_cutaway,
     plot_outlines,
+    plot_passable,
     plot_shadows,
     plot_solids,
     static_scene,
@@ -94,7 +95,7 @@ def plot_path(
     outcome: str = "goal",
     goal_radius_m: float = 2.0,
 ) -> Figure:
-    """Draws the flown path in 3-D and from above, coloured by speed, written to `file` as PNG.
+    """Draws the flown path in 3-D, from above and as altitude, coloured by speed, written to `file` as PNG.
 
     What a solid hides is faint; the shortest path is dashed; those of other drones in the world are grey.
 
@@ -111,8 +112,9 @@ def plot_path(
     points, speed = points[thin], np.linalg.norm(velocity[thin], axis=1)
     scale = Normalize(0.0, max(float(np.ceil(speed.max())), 1.0))
     start, goal = points[0], _ends(scene)[1]
-    with open_figure(9.6, 3.9, file) as figure:
-        oblique, above = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
+    with open_figure(9.6, 4.9, file) as figure:
+        grid = figure.add_gridspec(2, 2, width_ratios=(1.75, 1.0), height_ratios=(3.2, 1.0))
+        oblique, above = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
         for axes, view in ((oblique, OBLIQUE), (above, MAP)):
             solids = plot_stage(axes, view, scene, goal_radius_m)
             if view is OBLIQUE:
@@ -129,9 +131,12 @@ def plot_path(
             if outcome != "goal":
                 x, y = view.project(points[-1])
                 axes.plot(x, y, "X", ms=8, mfc=OUTCOME_COLOURS[outcome], mec="white", mew=0.8, zorder=10)
+        profile = figure.add_subplot(grid[1, 1])
+        _plot_altitude(profile, points, speed, scale, shortest, np.asarray(scene.volume, np.float64))
         bar = figure.colorbar(
-            ScalarMappable(scale, SPEED_COLOURS), ax=above, shrink=0.75, aspect=28, pad=0.03, label="speed, m/s"
+            ScalarMappable(scale, SPEED_COLOURS), ax=[above, profile], shrink=0.75, aspect=28, pad=0.03
         )
+        bar.set_label("speed, m/s")
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
         figure.legend(handles=_path_legend(shortest is not None, outcome), loc="outside lower center", ncols=5)
     return figure
@@ -171,6 +176,7 @@ def _plot_obstacles(axes: Axes, view: View, scene: Scene) -> list[Solid]:
     world = make_cutaway(scene, view)
     if view is not MAP:
         plot_shadows(axes, view, world.shown, _corners(np.asarray(scene.volume, np.float64)))
+    plot_passable(axes, view, world.passable)
     plot_solids(axes, view, world.shown)
     plot_outlines(axes, view, [*world.near_walls, *world.moving])
     if world.note:
@@ -259,6 +265,33 @@ def _plot_flown(
 ) -> None:
     covered = is_occluded((points[:-1] + points[1:]) / 2, solids, view)
     plot_coloured(axes, view.project(points), speed, covered, cmap=SPEED_COLOURS, norm=scale)
+
+
+def _plot_altitude(
+    axes: Axes,
+    points: np.ndarray,
+    speed: np.ndarray,
+    scale: Normalize,
+    shortest: np.ndarray | None,
+    volume: np.ndarray,
+) -> None:
+    """Draws height over the distance flown, and that of the shortest path over its own, up to the volume's top."""
+    along = _lengths(points)
+    if shortest is not None:
+        corners = np.asarray(shortest, np.float64)
+        axes.plot(_lengths(corners), corners[:, 2], color=SHORTEST_COLOUR, ls=(0, (4, 2.5)), lw=1.0, zorder=5)
+    shown = np.zeros(len(points) - 1, bool)
+    plot_coloured(
+        axes, np.stack([along, points[:, 2]], axis=1), speed, shown, width=1.8, cmap=SPEED_COLOURS, norm=scale
+    )
+    axes.set(xlim=(0, max(along[-1], 1.0)), ylim=(volume[0, 2], volume[1, 2]))
+    axes.set_xlabel("distance flown, m")
+    axes.set_ylabel("altitude, m")
+
+
+def _lengths(points: np.ndarray) -> np.ndarray:
+    """Returns the length of the way up to each of points [K, 3], metres."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 
 
 def plot_coloured(

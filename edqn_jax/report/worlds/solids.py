@@ -28,6 +28,10 @@ ABOVE_M = 1.0
 """Metres above start and goal at which what is above them is cut off, and below them what a map shows no more."""
 NEARLY_ALL = 0.75
 """Share of the volume's width that a ceiling or an outer wall covers."""
+PASSABLE_M = 1.0
+"""Metres between a solid and the floor or the ceiling from which on a map shows it as open."""
+PALE = 0.3
+"""Share of its own colour that an open solid has on a map; the rest is the ground's."""
 
 
 @dataclass(frozen=True)
@@ -154,12 +158,15 @@ class CutawayView:
     """What moves, where it is at time 0: drawn as outlines."""
     cut: tuple[float, float] | None = None
     """Heights, metres, between which a shape is shown."""
+    passable: list[Solid] = dataclasses.field(default_factory=list)
+    """On a map of a closed world: what can be flown under or over, such as the wall above a door; drawn pale."""
 
     @property
     def note(self) -> str:
         """Note on what was cut away, for the figure; empty if nothing was."""
         parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", self.near_walls)) if cut]
         notes = [f"{' and '.join(parts)} cut away"] if parts else []
+        notes += ["open is pale"] if self.passable else []
         if self.cut is not None:
             low, high = self.cut
             notes.append(f"cut off above {high:.1f} m" + (f", and below {low:.1f} m" if np.isfinite(low) else ""))
@@ -168,6 +175,9 @@ class CutawayView:
 
 def make_cutaway(scene: Scene, view: View) -> CutawayView:
     """Returns a world as it is drawn: without its ceiling, without outer walls before the eye, and what moves apart.
+
+    On a map of a world with a ceiling, what leaves a gap of `PASSABLE_M` above or below it is apart, too: else the wall
+    above a door would close it.
 
     A ceiling is a box or another shape in the upper half of the volume that covers nearly all of it, or a plane
     that looks down there; an outer wall runs along nearly a whole side of the volume.
@@ -193,7 +203,17 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
             near_walls.append(solid)
         else:
             shown.append(solid)
-    return CutawayView(shown, near_walls, has_ceiling, moving_solids(scene, 0.0), cut)
+    passable = [solid for solid in shown if _is_passable(solid, lower[2], upper[2])]
+    if view.elevation < 89 or not has_ceiling:
+        passable = []
+    shown = [solid for solid in shown if not any(solid is each for each in passable)]
+    return CutawayView(shown, near_walls, has_ceiling, moving_solids(scene, 0.0), cut, passable)
+
+
+def _is_passable(solid: Solid, floor: float, ceiling: float) -> bool:
+    """Whether a drone fits under or over a solid."""
+    heights = solid.corners[:, 2]
+    return bool(heights.min() - floor >= PASSABLE_M or ceiling - heights.max() >= PASSABLE_M)
 
 
 def boundary_side(solid: Solid, lower: np.ndarray, upper: np.ndarray) -> tuple[int, int] | None:
@@ -236,6 +256,14 @@ def plot_solids(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
     # Edges in the face's own colour close the hairline between neighbouring faces.
     bodies = PolyCollection(rings, facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=2)
     axes.add_collection(bodies)
+
+
+def plot_passable(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
+    """Draws solids that leave a way above or below them, pale."""
+    ground = np.array([int(GROUND[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    rings, colours = faces_seen(view, solids)
+    pale = [PALE * colour + (1 - PALE) * ground for colour in colours]
+    axes.add_collection(PolyCollection(rings, facecolors=pale, edgecolors=pale, linewidths=0.3, zorder=1.8))
 
 
 def faces_seen(view: View, solids: Sequence[Solid]) -> tuple[list[np.ndarray], list[np.ndarray]]:
