@@ -179,11 +179,12 @@ def _ahead(cell: Cell) -> str:
 
 def _bytes_table(rows: Sequence[success.Row]) -> str:
     first = rows[0]
-    heads = [f"{size} bytes an event" for size in traffic.EVENT_BYTES]
+    heads, worlds = [f"{size} bytes an event" for size in traffic.EVENT_BYTES], first["test_seed"] * first["missions"]
     lines = [
-        f"Bytes: the policy {first['policy']} in {first['missions']} test worlds each, {traffic.MOMENTS} moments of "
-        "0.2 s a flight, an ESIM sensor without noise. The break-even is the frame rate at which 8-bit frames cost as "
-        "many bytes a second, with its 95 % interval over flights: slower frames cost less than events.",
+        f"Bytes: the policy {first['policy']} in {first['missions']} test worlds each, from {worlds} on, "
+        f"{traffic.MOMENTS} moments of 0.2 s a flight, an ESIM sensor without noise. The break-even is the frame rate "
+        "at which 8-bit frames cost as many bytes a second, with its 95 % interval over flights: slower frames cost "
+        "less than events.",
         "",
         f"| world | look | pixels | contrast | events a second | {' | '.join(f'break-even, {x}' for x in heads)} |",
         f"| --- | --- | --- | ---: | ---: |{' ---: |' * len(heads)}",

@@ -107,6 +107,8 @@ def _flight_rules(config: Config, trains: bool) -> Rules:
         yield lit.holds(light.most_lux), "light.most_lux", lit.says
         least = light.least_lux <= light.most_lux
         yield least, "light.least_lux", f"at most light.most_lux ({light.most_lux:g})"
+    held = env.actions != "body-rates" or not env.setpoint_m_s2
+    yield held, "env.setpoint_m_s2", "0 with env.actions body-rates: no velocity is held"
     yield light.most_lux > 0 or not light.told, "light.told", "false without light.least_lux and light.most_lux"
     exposed = exposure.real or not (light.told and env.sensor in ("frames", "frame-pair"))
     yield exposed, "exposure.real", f"true with light.told and env.sensor {env.sensor}"

@@ -125,7 +125,8 @@ def _rows_shown(
         shown = np.arange(every, decisions + 1, every) * steps - 1
         return np.minimum(shown, count - 1), every * steps * drone.physics_dt_s / frame_s
     pace = speed * frame_s / drone.physics_dt_s  # rows a frame
-    return np.minimum(np.round(np.arange(1, max(int(count / pace), 1) + 1) * pace).astype(int), count) - 1, speed
+    passed = np.round(np.arange(1, max(int(count / pace), 1) + 1) * pace).astype(int)
+    return np.clip(passed, 1, count) - 1, speed
 
 
 @dataclasses.dataclass(frozen=True)

@@ -177,6 +177,8 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--seeds", "many"], "--seeds must be a whole number, not 'many'"),
         (["train", "--agent.double", "yes"], "'yes' is a word too many; 'edqn train --help' lists what there is"),
         (["evaluate", "pretrained", "--start", "1", "2"], "--start must be X Y Z, not '1 2'"),
+        (["evaluate", "pretrained", "--start", "1]", "2", "3"], "--start must be X Y Z, not '1] 2 3'"),
+        (["evaluate", "pretrained", "--missions", "a'b"], """--missions must be a whole number, not 'a'b'"""),
         (["evaluate", "pretrained", "--missions"], "--missions must be followed by a value"),
         (["record"], "'edqn record' needs POLICY and FILE; see 'edqn record --help'"),
         (["completion", "csh"], "shell cannot be 'csh'"),

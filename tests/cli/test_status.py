@@ -87,7 +87,10 @@ def test_a_pipe_sees_the_first_line_at_once_and_its_output_is_the_commands_own()
     assert re.fullmatch(r"edqn evaluate: starting, 0:0\d\n", ended.stderr) and ended.stdout == "light\ndone\n"
 
 
-@pytest.mark.parametrize("argv", [[], ["--version"], ["train", "--help"], ["completion", "bash"]])
+@pytest.mark.parametrize(
+    "argv",
+    [[], ["--version"], ["train", "--help"], ["completion", "bash"], ["fly", "p.onnx", "--clock", "127.0.0.1:1"]],
+)
 def test_what_is_there_at_once_has_no_line_in_a_pipe(argv: list[str]) -> None:
     assert shown_in_a_pipe(*argv).stderr == ""
 

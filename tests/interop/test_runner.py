@@ -320,6 +320,13 @@ def test_a_state_that_cannot_be_is_refused(exported, wrong, says):
         runner.Runner(exported).decide(each.packet, each.until_us, **(each.given | wrong))
 
 
+@pytest.mark.parametrize("packet", [[], np.zeros((5, 2, 24, 32)), np.zeros((1, 2, 24, 31))])
+def test_counts_of_another_form_are_refused(exported, packet):
+    each = whole_flight(0)[0]
+    with pytest.raises(ValueError, match="structured array"):
+        runner.Runner(exported).decide(packet, each.until_us, **each.given)
+
+
 # -------------------------------------------------------------------------------------------- export
 
 

@@ -57,6 +57,8 @@ def test_speed_and_frames_a_second_say_what_frames_show_and_a_size_is_that_of_th
     assert rows.tolist() == [19, 39, 59, 79] and speed == 2.0
     rows, speed = _rows_shown(drone, a_flight(6.4), None, 0.1)
     assert rows.tolist() == [12, 25, 38, 51, 64, 77] and speed == pytest.approx(2.6)
+    rows, _ = _rows_shown(drone, a_flight(6.4), 1.0, 1 / 120)  # a frame is less than half of a step
+    assert rows[0] == 0 and rows[-1] <= 82 and np.all(np.diff(rows) >= 0)
 
 
 def test_a_video_that_would_not_fit_into_memory_is_refused():

@@ -6,7 +6,7 @@ import ast
 import contextlib
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from edqn_jax.errors import ConfigError, suggest_nearest
@@ -54,7 +54,7 @@ def sentence_of(box: str, command: str) -> str:
         more = "is a word" if len(words) == 1 else "are words"
         return f"{' and '.join(map(repr, words))} {more} too many; {see}"
     if found := re.match(r"invalid choice '(.*)' for argument '(.*?)'\. Expected one of (\(.*\))\.", text):
-        return f"{found[2]} cannot be '{found[1]}'{suggest_nearest(found[1], ast.literal_eval(found[3]))}"
+        return f"{found[2]} cannot be '{found[1]}'{suggest_nearest(found[1], _literal(found[3]) or ())}"
     if found := re.match(r"Missing value for argument '(.*?)'\. Expected (\d+)", text):
         return f"{found[1]} must be followed by {'a value' if found[2] == '1' else f'{found[2]} values'}"
     if found := re.match(r"Error parsing (\S+): (.*)", text):
@@ -62,10 +62,22 @@ def sentence_of(box: str, command: str) -> str:
     return f"{text}; {see}"
 
 
+def _literal(text: str) -> Sequence[str] | None:
+    """Returns the words of a list or a tuple that Python wrote; None where it is cut off."""
+    try:
+        return ast.literal_eval(text)
+    except (SyntaxError, ValueError):
+        return None
+
+
 def _about_value(flag: str, text: str, lines: list[str]) -> str:
     """Returns the sentence on a value that is none of its option's."""
     takes = next((line.split(flag, 1)[1].strip() for line in lines if line.strip().startswith(f"{flag} ")), "")
-    given = re.search(r"(?:instantiated from|valid parse for arguments:) (\[.*?\])", text)
-    value = " ".join(ast.literal_eval(given[1])) if given else (re.findall(r"'([^']*)'", text) or ["that"])[-1]
+    given = re.search(r"(?:instantiated from|valid parse for arguments:) (\[.*)", text)
+    # A value may have brackets of its own.
+    ends = [end.end() for end in re.finditer(r"\]", given[1])] if given else []
+    words = next((words for end in ends if given and (words := _literal(given[1][:end]))), None)
+    quoted = re.findall(r"""'[^']*'|"[^"]*\"""", text)
+    value = " ".join(words) if words else quoted[-1][1:-1] if quoted else "that"
     kind = next((kind for says, kind in _KINDS.items() if says in text), None)
     return f"{flag} must be {kind or _LISTS.get(takes, takes) or 'of another form'}, not '{value}'"

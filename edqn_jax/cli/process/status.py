@@ -135,15 +135,15 @@ def end_status() -> None:
 def shown_status(argv: Sequence[str], outputs: Sequence[Lasting]) -> Iterator[None]:
     """Shows within the block what the command of these words does.
 
-    Nothing is shown where standard error is closed or another program's, nor, but on a terminal, before what is there
-    at once: a help, versions or a script.
+    Nothing is shown where standard error is closed or another program's, in a process of a simulated flight, whose
+    command shows its own, nor, but on a terminal, before what is there at once: a help, versions or a script.
 
     Args:
         argv: words of the command.
         outputs: of `lasting_streams`; the line makes way for what is written to them.
     """
     error = next((output for output in outputs if output.fileno() == 2), None)
-    if error is None:
+    if error is None or any(word.partition("=")[0] == "--clock" for word in argv):
         yield
         return
     lives = error.isatty() and os.environ.get("TERM") not in (None, "", "dumb")

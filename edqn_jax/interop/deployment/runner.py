@@ -157,8 +157,8 @@ class Runner:
         turn = _numbers("yaw_rate", yaw_rate, ())
         move = self._last_move if last_move is None else _numbers("last_move", last_move, (3,))
         yaw = heading_of(attitude)
-        number = packet
-        if packet.dtype.names is not None or packet.ndim != 4:
+        number, pairs = packet, len(self.about["frame_times_us"]) - 1
+        if getattr(packet, "shape", None) != (pairs, 2, *self._grid.pixels.shape):
             number = _numbers_of(self.about, packet, until_us - self.window_us, self._grid)
         counts = _counts_of(self.about, number, self._grid, self._contrast)
         values, memory = self._session.run(

@@ -70,7 +70,8 @@ def filter_log_brightness(
     def pair(lag: Array, xs: tuple[Array, Array]) -> tuple[Array, Array]:
         change, r = xs
         fade = -jnp.expm1(-r)
-        lag = lag * (1.0 - fade) - change * fade / jnp.maximum(r, 1e-12)
+        # Of a jump, in no time, nothing is followed.
+        lag = lag * (1.0 - fade) - change * jnp.where(r > 0.0, fade / jnp.maximum(r, 1e-12), 1.0)
         return lag, lag
 
     # As in `events`: a window of two or three frames needs no loop.

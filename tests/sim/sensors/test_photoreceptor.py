@@ -62,6 +62,12 @@ def test_a_frame_in_between_that_is_on_the_line_changes_nothing():
     np.testing.assert_allclose(fine[-1], coarse[-1], rtol=1e-6)
 
 
+def test_of_a_jump_in_no_time_nothing_is_followed():
+    level, lag = jnp.array([0.0, 1.0])[:, None, None], jnp.full((1, 1), -0.2)
+    _, last = photoreceptor.filter_log_brightness(30.0, level, np.array([0.0, 0.0]), jnp.ones((1, 1, 1)), lag)
+    assert abs(float(last[0, 0]) + 1.2) < 1e-6
+
+
 def test_a_step_of_a_white_pixel_is_followed_to_63_percent_in_the_time_constant():
     """After the step x stays; the pixel had settled before it."""
     time_constant = 1 / (2 * np.pi * 30.0)
