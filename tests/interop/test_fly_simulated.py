@@ -53,6 +53,7 @@ EASY = """
 """
 
 SIZE = (64, 48)
+ABOUT = {"frame_times_us": [-160_000, 0]}
 """A small camera, so that the flight takes seconds."""
 
 
@@ -142,7 +143,8 @@ def test_a_connection_that_ends_is_silent_only_where_it_is_the_simulations(
     close = SimulatedClock.close
     monkeypatch.setattr(SimulatedClock, "close", lambda clock: (left.append(clock), close(clock)))
     monkeypatch.setattr(Pilot, "fly", fail)
-    monkeypatch.setattr(command, "load_runner", lambda args, size, lens: SimpleNamespace(period_s=0.26))
+    unneeded = SimpleNamespace(period_s=0.26, about=ABOUT)
+    monkeypatch.setattr(command, "load_runner", lambda args, size, lens: unneeded)
     server = EventServer(SIZE)
     wire = ["--events", f"tcp:{server.address}", "--mavlink", f"udpin:127.0.0.1:{free_port()}"]
     with socket.create_server(("127.0.0.1", 0)) as keeper, contextlib.ExitStack() as stack:
@@ -227,7 +229,8 @@ def test_a_process_that_is_stopped_or_killed_leaves_a_vehicle_that_holds(
     _, said = flight.communicate(timeout=30)
     assert flight.returncode == code
     if number != signal.SIGKILL:
-        assert said.count("\n") == 1 and "the flight was stopped: process stopped" in said
+        first, last = said.splitlines()
+        assert first == "edqn fly: starting, 0:00" and "the flight was stopped: process stopped" in last
         assert read_records(tmp_path / "flight")[-1]["outcome"] == "process stopped"
 
 
