@@ -1,13 +1,10 @@
-"""The simulated camera's ESIM: its law by hand, and evlib's events."""
+"""The simulated camera's ESIM: its law by hand; beside evlib's in tests/interop."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
-from numpy.typing import NDArray
 
 from edqn_jax.fly.simulated.esim import Esim
-from edqn_jax.interop.outer.event_cameras import CONTRAST, esim
 
 
 def test_an_event_tells_each_contrast_that_the_log_brightness_changes_and_the_rest_is_kept() -> None:
@@ -16,23 +13,3 @@ def test_an_event_tells_each_contrast_that_the_log_brightness_changes_and_the_re
     seen = [camera.events(0.1 * np.exp([[0.0, level, 0.0]])) for level in levels]
     assert [signs.tolist() for *_, signs in seen] == [[], [1, 1], [1], [-1] * 3, []]
     assert all((columns == 1).all() and (rows == 0).all() for columns, rows, _ in seen)
-
-
-def test_its_events_are_evlibs() -> None:
-    pytest.importorskip("evlib")
-    pytest.importorskip("torch")
-    ours, theirs = Esim(CONTRAST), esim()
-    y, x = np.mgrid[:40, :60]
-
-    def image(columns: NDArray, rows: NDArray, signs: NDArray) -> NDArray:
-        counts = np.zeros((40, 60))
-        np.add.at(counts, (rows, columns), signs)
-        return counts
-
-    total, other = 0, 0.0
-    for k in range(30):
-        frame = 0.5 + 0.49 * np.sin(0.3 * x + 0.2 * y + 0.2 * k) * np.cos(0.1 * x - 0.3 * k)
-        packet = theirs(frame, 0.005 * k)
-        total += len(packet)
-        other += float(np.abs(image(*ours.events(frame)) - image(packet["x"], packet["y"], packet["p"])).sum())
-    assert total > 10_000 and other <= 1e-4 * total  # a level may be rounded to the other side
