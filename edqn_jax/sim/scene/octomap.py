@@ -47,7 +47,7 @@ def read_octomap(file: Path) -> tuple[NDArray[np.float64], float]:
     for edge in np.unique(leaves[:, 3]):
         within = np.indices((edge, edge, edge)).reshape(3, -1).T
         parts.append((leaves[leaves[:, 3] == edge, None, :3] + within).reshape(-1, 3))
-    return side * (np.concatenate(parts) + 0.5 - 2 ** (_DEPTH - 1)), side
+    return side * (np.concatenate(parts).astype(np.float64) + 0.5 - 2 ** (_DEPTH - 1)), side
 
 
 def _resolution(file: Path, content: bytes) -> tuple[float, bytes]:
