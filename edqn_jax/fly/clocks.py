@@ -10,6 +10,9 @@ from typing import Protocol
 class Clock(Protocol):
     """The host's clock, real or simulated."""
 
+    passes: bool
+    """Whether time passes by itself, so that something can be waited for."""
+
     def now(self) -> float:
         """Returns seconds since some moment; never runs back."""
         ...
@@ -25,6 +28,8 @@ class Clock(Protocol):
 
 class WallClock:
     """The machine's monotonic clock."""
+
+    passes = True
 
     def now(self) -> float:
         """Returns its seconds."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import time
 from collections.abc import Callable
 from typing import Any
@@ -22,6 +23,9 @@ from edqn_jax.interop.recordings.lens import Lens
 
 TICK_S = 0.02
 """Setpoints are sent at 50 Hz."""
+
+PATIENCE_S = 0.012
+"""Longest that a decision waits for the camera's next packet, so that it is made on events that are new."""
 
 GAP_S = 0.1
 """Longer gaps between setpoints are counted; PX4 leaves offboard mode after 0.5 s."""
@@ -131,6 +135,8 @@ class Pilot:
         if self._log is not None:
             about = self.runner.about
             self._log.write("settings", settings=self.settings, pace=self._pace, **self._camera, about=about)
+        gc.collect()
+        gc.freeze()  # what lives now is not looked through again in flight, which takes 10 ms and more
         began, ticks = self.clock.now(), 0
         try:
             while self.state.phase is not Phase.ENDED:
@@ -154,9 +160,9 @@ class Pilot:
     def tick(self) -> None:
         """Reads, decides where it is time to, and sends."""
         awoke, now = time.perf_counter(), self.clock.now()
-        self.source.read(now, getattr(self.clock, "streamed_us", -1))
-        self.link.read(now)
-        self._count()
+        self._read(now)
+        if self.clock.passes and self.state.phase is Phase.FLYING and now >= self._due - 1e-6:
+            awoke, now = self._await_packet()
         read_s = time.perf_counter() - awoke
         inputs = self._inputs()
         before = self.state.phase
@@ -187,8 +193,21 @@ class Pilot:
         if self.state.phase is not before:
             self._tell(f"{now:.2f} s: {self.state.phase}" + (f" ({why})" if (why := self._why()) else ""))
 
-    def _count(self) -> None:
-        """Counts the packets that are new."""
+    def _await_packet(self) -> tuple[float, float]:
+        """Reads until the camera's next packet is there, or patience ends; returns when it came, on both clocks."""
+        events = self.source.events
+        awoke, now = time.perf_counter(), self.clock.now()
+        known, end = events.until_us, now + PATIENCE_S
+        while events.until_us == known and now < end:
+            self.source.wait(end - now)
+            awoke, now = time.perf_counter(), self.clock.now()
+            self._read(now)
+        return awoke, now
+
+    def _read(self, now: float) -> None:
+        """Takes what has come from camera and vehicle, and counts the packets that are new."""
+        self.source.read(now, getattr(self.clock, "streamed_us", -1))
+        self.link.read(now)
         events = self.source.events
         if events.until_us < self._counted_us:  # the camera's clock began anew
             self._counted_us = -1

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import select
 import socket
 import struct
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
@@ -34,6 +36,9 @@ START_S = 5.0
 """Longest that a camera takes to answer."""
 
 CHUNK = 1 << 20
+
+POLL_S = 0.0005
+"""Between two looks at a camera that cannot be waited for."""
 
 
 class Events:
@@ -91,6 +96,10 @@ class EventSource(Protocol):
 
     def read(self, now: float, least_us: int = -1) -> None:
         """Takes what has come; waits until it is known up to `least_us`, if the camera has sent that."""
+        ...
+
+    def wait(self, most_s: float) -> None:
+        """Returns once something has come that was not read, or after so many seconds of the machine."""
         ...
 
     def close(self) -> None:
@@ -177,6 +186,10 @@ class SocketStream:
             for until, events in self._decoder.feed(data):
                 self.events.add(events, until, now)
 
+    def wait(self, most_s: float) -> None:
+        """Returns once something has come, or after so many seconds."""
+        select.select([self._socket], [], [], most_s)
+
     def close(self) -> None:
         """Closes the connection."""
         self._socket.close()
@@ -207,6 +220,10 @@ class DvStream:
             if events.size:
                 self.events.add(events, int(events["t"].max()) + 1, now)
 
+    def wait(self, most_s: float) -> None:
+        """Returns soon: its reader cannot be waited for."""
+        time.sleep(min(most_s, POLL_S))
+
     def _next(self) -> Any:
         """Returns a batch of events; None if none has come, or the stream has ended."""
         with contextlib.suppress(RuntimeError):
@@ -236,6 +253,10 @@ class Recorded:
             return
         self.events.add(self._events[self._next : end].astype(EVENT), until, now)
         self._next = end
+
+    def wait(self, most_s: float) -> None:
+        """Returns soon: events come as time passes."""
+        time.sleep(min(most_s, POLL_S))
 
     def close(self) -> None:
         """Does nothing."""

@@ -14,6 +14,7 @@ from edqn_jax.cli import fly as command
 from edqn_jax.errors import ConfigError
 from edqn_jax.fly.faults import Fault, Inputs
 from edqn_jax.fly.machine import Phase
+from edqn_jax.fly.pilot import PATIENCE_S, TICK_S
 from edqn_jax.fly.records import EVENTS, RECORDS, FlightLog, inputs_of, read_records, settings_of
 from edqn_jax.fly.replay import replay
 from edqn_jax.fly.streams import EVENT, read_stream
@@ -21,7 +22,7 @@ from edqn_jax.fly.tally import events_at_pace
 from edqn_jax.interop.deployment.runner import Command
 from edqn_jax.interop.recordings.lens import Lens
 from tests.support.virtual_flight import CAMERA, PERIOD_S
-from tests.support.virtual_pilot import SETTINGS, Camera, Policy, Wire, make
+from tests.support.virtual_pilot import SETTINGS, Camera, Policy, Time, Wire, make
 
 
 def test_a_flight_reaches_its_goal_and_sends_what_was_decided() -> None:
@@ -52,6 +53,46 @@ def test_a_log_is_played_again_with_the_same_outputs_and_moves(tmp_path: Path) -
     lines[number] = json.dumps(json.loads(lines[number]) | {"move": 99})
     file.write_text("\n".join(lines) + "\n{cut off")
     assert replay(tmp_path / "flight", Policy()).other_moves == 1  # pyright: ignore[reportArgumentType]
+
+
+class Packets(Camera):
+    """A camera that sends a packet each 7 ms, until it ends."""
+
+    def __init__(self, time: Time, ends_at: float = np.inf) -> None:
+        super().__init__()
+        self._time, self._ends, self._sent = time, ends_at, -1
+
+    def read(self, now: float, least_us: int = -1) -> None:
+        while (self._sent + 1) * PACKET_S <= min(now, self._ends) + 1e-9:
+            self._sent += 1
+            events = np.zeros(1000, EVENT)
+            until = round(1e6 * self.shows(self._sent * PACKET_S))
+            events["t"], events["p"] = until - 1, 1
+            self.events.add(events, until, now)
+
+    def wait(self, most_s: float) -> None:
+        following = (self._sent + 1) * PACKET_S if self._time.moment < self._ends else np.inf
+        self._time.moment = min(self._time.moment + most_s, following)
+
+
+PACKET_S = 0.007
+
+
+def test_a_decision_begins_with_a_packet_that_is_new_and_waits_for_none_that_does_not_come() -> None:
+    time = Time()
+    time.passes = True
+    pilot, wire = make(camera=Packets(time), clock=time)
+    report = pilot.fly()
+    assert report.outcome == "goal" and len(report.latency.age) > 10
+    # Setpoints come each 20 ms, packets each 7: without waiting, the newest is 3 ms old in the mean. The first decision
+    # does not wait: it is made as soon as the vehicle is in offboard mode.
+    assert max(report.latency.age[1:]) < 0.01
+    time = Time()
+    time.passes = True
+    pilot, wire = make(camera=Packets(time, ends_at=time.now() + 1.0), clock=time)
+    pilot.fly()
+    gaps = np.diff([now for now, velocity, _ in wire.sent if velocity is not None])
+    assert pilot.state.fault is Fault.NO_EVENTS and gaps.max() < TICK_S + PATIENCE_S + 0.004 + 1e-6
 
 
 LENS = Lens((64, 48), (60.0, 60.0, 32.0, 24.0), "radtan", (-0.1, 0.0, 0.0, 0.0))

@@ -145,6 +145,8 @@ def test_a_ground_station_on_another_endpoint_is_forwarded(make: Callable[..., T
 class Steps:
     """A clock that lets the vehicle fly while the pilot sleeps, and what happens to it at a time."""
 
+    passes = False
+
     def __init__(self, both: Together, at: float, happens: Callable[[Together], None]) -> None:
         self.both, self._at, self._happens = both, both.now + at, happens
 
@@ -171,6 +173,8 @@ class Sees:
         events = np.zeros(5000, EVENT)
         events["t"], events["p"] = round(1e6 * now) - 1, 1
         self.events.add(events, round(1e6 * now), now)
+
+    def wait(self, most_s: float) -> None: ...
 
     def close(self) -> None: ...
 

@@ -22,6 +22,8 @@ SETTINGS = Settings(goal=GOAL, fence=FENCE, camera=CAMERA, period_s=PERIOD_S)
 class Time:
     """Virtual time."""
 
+    passes = False
+
     def __init__(self) -> None:
         self.moment = 50.0
 
@@ -107,13 +109,18 @@ class Camera:
         """Returns seconds of its clock."""
         return now + 7.0
 
+    def wait(self, most_s: float) -> None:
+        raise AssertionError("virtual time does not pass while one waits")
+
     def close(self) -> None: ...
 
 
-def make(policy: Any = None, wire: Any = None, camera: Any = None, **more: Any) -> tuple[Pilot, Any]:
+def make(
+    policy: Any = None, wire: Any = None, camera: Any = None, clock: Time | None = None, **more: Any
+) -> tuple[Pilot, Any]:
     wire = wire or Wire()
     known = {name: more.pop(name) for name in ("pace", "dry", "fov_deg", "contrast", "lens") if name in more}
     task = Task(more.pop("settings", SETTINGS), FENCE, **known)
     flier: Any = policy or Policy()
-    pilot = Pilot(flier, wire, camera or Camera(), Time(), task, tell=lambda _: None, **more)
+    pilot = Pilot(flier, wire, camera or Camera(), clock or Time(), task, tell=lambda _: None, **more)
     return pilot, wire

@@ -30,6 +30,8 @@ START_S = 120.0
 class SimulatedClock:
     """A member's clock; `Clock` of `edqn_jax.fly.clocks`."""
 
+    passes = False
+
     def __init__(self, address: str, name: str) -> None:
         """Joins the clock at `HOST:PORT` under a name of one word.
 
