@@ -15,7 +15,7 @@ from jax import Array
 
 from edqn_jax.config import NETWORKS, AgentConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.perception.layers import init_params
+from edqn_jax.learn.perception.layers import Dense, init_params
 from edqn_jax.sim.actions import ACTIONS
 
 Params = Any
@@ -32,14 +32,14 @@ class QNetwork(nn.Module):
     def __call__(self, x: Array) -> Array:
         """Returns values [..., actions] of stacked observations `x` [..., history * observation]."""
         for width in self.config.hidden:
-            x = nn.Dense(width)(x)
+            x = Dense(width)(x)
             if self.config.layer_norm:
                 x = nn.LayerNorm()(x)
             x = nn.relu(x)
         if not self.config.dueling:
-            return nn.Dense(self.actions)(x)
+            return Dense(self.actions)(x)
         # Q = V + A - mean A (Wang et al. 2016, Eq. 9), both heads in one product.
-        heads = nn.Dense(self.actions + 1)(x)
+        heads = Dense(self.actions + 1)(x)
         advantage = heads[..., 1:]
         return heads[..., :1] + advantage - jnp.mean(advantage, axis=-1, keepdims=True)
 

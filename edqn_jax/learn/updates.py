@@ -26,6 +26,7 @@ from edqn_jax.learn.qnetwork import Params, skip_nonfinite
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.native.all_sum import all_sum
+from edqn_jax.native.products import in_precision
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.task import task_of
 
@@ -114,7 +115,8 @@ def update_vae(
 
     def loss(params: Params, batch: Samples, noise: Array):
         sensed = samples.to_encoder_input(batch)
-        total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise)
+        with in_precision(config.train.products):
+            total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise)
         return total * part, parts
 
     def update(networks: Networks, keys: Array):

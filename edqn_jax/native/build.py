@@ -103,8 +103,8 @@ def ensure_registered(
     """Loads a source's library and registers its handlers with XLA; returns whether that was possible.
 
     It is the one that the package brings; where there is none, or CC names a compiler, it is compiled here. Where that
-    was not possible, a warning says why. The source may export `edqn_unusable`, which returns why it cannot be used on
-    this machine, or a null pointer.
+    was not possible, a warning says why. A source NAME.c may export `edqn_unusable_NAME`, which returns why it cannot be
+    used on this machine, or a null pointer.
 
     Args:
         source: C, with XLA's header for foreign functions.
@@ -144,7 +144,7 @@ def _register(load: Callable[[], ctypes.CDLL], source: Path, targets: tuple[str,
     """Loads a library and registers its handlers with XLA; returns whether that was possible, and warns if not."""
     try:
         library = load()
-        _check_usable(library)
+        _check_usable(library, source)
         for target in targets:
             handler = jax.ffi.pycapsule(getattr(library, target))
             jax.ffi.register_ffi_target(target, handler, platform=by.platform)
@@ -158,13 +158,13 @@ def _register(load: Callable[[], ctypes.CDLL], source: Path, targets: tuple[str,
     return True
 
 
-def _check_usable(library: ctypes.CDLL) -> None:
-    """Asks a library whether it can be used here.
+def _check_usable(library: ctypes.CDLL, source: Path) -> None:
+    """Asks a library whether what it has of a source can be used here.
 
     Raises:
         OSError: with its answer, if it cannot.
     """
-    ask = getattr(library, "edqn_unusable", None)
+    ask = getattr(library, f"edqn_unusable_{source.stem}", None)
     if ask is not None:
         ask.restype = ctypes.c_char_p
         reason = ask()

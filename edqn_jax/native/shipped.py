@@ -25,7 +25,7 @@ FOLDER = Path(__file__).with_name("built")
 COMPILER = "compiler.txt"
 """In this folder: name and version of what compiled the library."""
 
-SOURCES = ("native/all_sum.c", "sim/camera/pictures.c", "sim/scene/shapes/field_rays.c")
+SOURCES = ("native/all_sum.c", "native/products.c", "sim/camera/pictures.c", "sim/scene/shapes/field_rays.c")
 """What is in it, below the package."""
 
 FLAGS = (
@@ -55,10 +55,14 @@ def library_of(kind: str) -> str:
 
 def kinds_of_processor(machine: str = platform.machine(), cpuinfo: Path = Path("/proc/cpuinfo")) -> list[str]:
     """Returns the kinds that this processor is of, the fastest first; none for a machine that is not in `KINDS`."""
+    return [kind for kind, needs in KINDS.get(machine, {}).items() if needs <= processor_flags(cpuinfo)]
+
+
+def processor_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
+    """Returns what Linux says that all of this machine's processors can do; nothing on another system."""
     lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
-    listed = [set(line.partition(":")[2].split()) for line in lines if line.startswith("flags")]
-    has = set.intersection(*listed) if listed else set()
-    return [kind for kind, needs in KINDS.get(machine, {}).items() if needs <= has]
+    listed = [frozenset(line.partition(":")[2].split()) for line in lines if line.startswith("flags")]
+    return frozenset.intersection(*listed) if listed else frozenset()
 
 
 def find_compiler(named: str = NAMED, usual: str = USUAL) -> list[str] | None:

@@ -96,7 +96,7 @@ def test_a_damaged_library_is_made_anew(source: Path, tmp_path: Path) -> None:
 
 
 def test_a_library_that_says_that_it_cannot_be_used_here_is_not(source: Path, caplog: pytest.LogCaptureFixture) -> None:
-    usable = "const char *edqn_unusable(void) { return 0; }\n"
+    usable = "const char *edqn_unusable_nothing(void) { return 0; }\n"
     source.write_text(SOURCE + usable, encoding="utf-8")
     compiler = shutil.which("cc") is not None
     assert ensure_registered(source, ("edqn_test_k",), ("NAME=edqn_test_k",)) is compiler and not caplog.records

@@ -25,6 +25,7 @@ from edqn_jax.learn.learner import Learner, Rings, UpdateStats
 from edqn_jax.learn.qnetwork import Params, make_optimiser, polyak_update, skip_nonfinite
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.native.all_sum import all_sum
+from edqn_jax.native.products import in_precision
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.task import task_of
 
@@ -84,7 +85,8 @@ def update_q(
         return ravel_pytree(params)[0]
 
     def loss(q: Array, target: Array, batch: replay.Batch):
-        return batch_loss(agent, tree(q), tree(target), len(ACTIONS), batch)
+        with in_precision(config.train.products):
+            return batch_loss(agent, tree(q), tree(target), len(ACTIONS), batch)
 
     def update(state: DqnState, keys: Array):
         batch = jax.vmap(lambda r, k: replay.sample_transitions(agent, r, rings.time, share, k, task))(rings.rows, keys)

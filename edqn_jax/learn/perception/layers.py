@@ -18,6 +18,7 @@ from jax import Array
 from jax.nn.initializers import lecun_normal, zeros
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.native.products import are_rounded, rounded_matmul
 from edqn_jax.user_code import check_takes, describe_object
 
 ROWS_OF_A_PART = 16_384
@@ -36,7 +37,7 @@ class Dense(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Array:
         """Returns `[..., features]` of `[..., K]`."""
-        y = shared_matmul(x, self.param("kernel", self.kernel_init, (x.shape[-1], self.features)))
+        y = matmul(x, self.param("kernel", self.kernel_init, (x.shape[-1], self.features)))
         return add_shared(y, self.param("bias", self.bias_init, (self.features,))) if self.use_bias else y
 
 
@@ -57,6 +58,11 @@ def init_params(module: Any, name: str, key: Array, **inputs: Any) -> Any:
         others = ", ".join(sorted(set(variables) - {"params"}))
         raise ConfigError(f"{name} must have parameters{f' alone, not {others}' if others else ''}")
     return variables["params"]
+
+
+def matmul(x: Array, kernel: Array) -> Array:
+    """Returns `x @ kernel`, `[..., F]`, of rows `[..., K]` and a kernel `[K, F]`, in the precision of what is traced."""
+    return rounded_matmul(x, kernel) if are_rounded() else shared_matmul(x, kernel)
 
 
 @jax.custom_vjp

@@ -20,7 +20,7 @@ from jax.nn.initializers import zeros
 from edqn_jax.config import ENCODERS, CameraConfig, EncoderConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.perception.code import EVENT_CHANNELS, Form, Params, kl_divergence
-from edqn_jax.learn.perception.layers import Dense, init_params
+from edqn_jax.learn.perception.layers import Dense, init_params, matmul
 from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
 from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosine_basis, paired_relu_init, wave_images
 from edqn_jax.sim.sensors.events import EventField, in_units
@@ -59,7 +59,7 @@ class Decoder(nn.Module):
         shape = (self.channels, *_output_size(self.config, self.height, self.width))
         kernel = self.param("kernel", wave_images(self.height, self.width), (z.shape[-1], *shape))
         bias = self.param("bias", zeros, shape)
-        amplitudes = z @ kernel.reshape(z.shape[-1], -1)
+        amplitudes = matmul(z, kernel.reshape(z.shape[-1], -1))
         return OUTPUT_SCALE * (amplitudes.reshape(*z.shape[:-1], *shape) + bias)
 
 

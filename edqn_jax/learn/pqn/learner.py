@@ -28,6 +28,7 @@ from edqn_jax.learn.pqn.returns import Rollout, lambda_returns, rollout_of
 from edqn_jax.learn.qnetwork import Params, make_optimiser, network_values, polyak_update, skip_nonfinite
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.native.all_sum import all_sum
+from edqn_jax.native.products import in_precision
 from edqn_jax.sim.actions import ACTIONS
 
 METRICS = ("q_loss", "mean_q")
@@ -101,7 +102,8 @@ def update_q(
     agent, pqn = config.agent, config.pqn
 
     def loss(q: Params, batch: Sample):
-        values = network_values(agent, q, batch.history)
+        with in_precision(config.train.products):
+            values = network_values(agent, q, batch.history)
         errors = jax.vmap(partial(td_loss, huber_delta=agent.huber_delta))(values, batch.action, batch.target)
         taken = jax.vmap(value_of)(values, batch.action)
         return jnp.sum(batch.weight * errors), (jnp.sum(batch.weight), jnp.sum(batch.weight * taken))

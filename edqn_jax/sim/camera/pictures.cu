@@ -367,7 +367,7 @@ EXPORTED XLA_FFI_Error* edqn_tilted_depths(XLA_FFI_CallFrame* call) { DRAW(measu
 
 #ifdef __CUDACC__
 /* Returns why the kernels cannot be run on this machine, or 0. Asks nothing that would take memory on a card. */
-EXPORTED const char* edqn_unusable(void) {
+EXPORTED const char* edqn_unusable_pictures(void) {
   int driver = 0, compiler = 0;
   const cudaError_t error = cudaDriverGetVersion(&driver), other = cudaRuntimeGetVersion(&compiler);
   if (error != cudaSuccess || other != cudaSuccess) return cudaGetErrorString(error != cudaSuccess ? error : other);

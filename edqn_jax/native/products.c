@@ -1,0 +1,245 @@
+/* Products of matrices in bfloat16 with sums in float32, for CPUs with AMX: handlers of XLA's foreign function
+ * interface (`products.py` registers them).
+ *
+ * Factors come in float32 and are rounded to the nearest bfloat16, ties to even. Both are laid out in tiles of 1 KB, as
+ * AMX wants them: of the left factor 16 rows of 32 numbers, of the right one 16 columns of 32 numbers in pairs.
+ */
+
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "handler.h"
+
+#if defined(__x86_64__) && defined(__linux__) && \
+    (defined(__clang__) ? __clang_major__ >= 12 : defined(__GNUC__) && __GNUC__ >= 11)
+
+#include <cpuid.h>
+#include <immintrin.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#define TILE 512   /* bfloat16 numbers in a tile */
+#define ROWS 16    /* of the left factor's tile, and columns of the right one's */
+#define DEPTH 32   /* of both: the sum runs over these */
+#define BLOCK 1024 /* numbers that are summed before the next are laid out, a multiple of DEPTH */
+
+#define WITH_AVX512 __attribute__((target("avx512f,avx512bw,avx512vl,avx512dq,avx512bf16")))
+#define WITH_AMX __attribute__((target("avx512f,avx512bw,avx512vl,avx512dq,avx512bf16,amx-tile,amx-bf16")))
+
+/* A factor in float32 as its tiles want it: `across` is the side that stays, `along` the one that is summed over. */
+typedef struct {
+  const float* data;
+  int64_t across, along;
+  int along_first; /* whether memory is [along, across], row by row, or [across, along] */
+} Factor;
+
+/* Returns why tiles cannot be multiplied here; NULL if they can. */
+static const char* find_fault(void) {
+  unsigned a, b, c, d;
+  const char* const missing = "this processor has no AMX for bfloat16";
+  if (!__builtin_cpu_supports("avx512bw") || !__builtin_cpu_supports("avx512vl") || !__builtin_cpu_supports("avx512dq"))
+    return missing;
+  if (!__get_cpuid_count(7, 1, &a, &b, &c, &d) || !(a >> 5 & 1)) return missing;
+  if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(d >> 22 & 1) || !(d >> 24 & 1)) return missing;
+  /* Linux gives a process the tiles' registers when it asks for them: ARCH_REQ_XCOMP_PERM, XTILEDATA. */
+  return syscall(SYS_arch_prctl, 0x1023, 18) == 0 ? 0 : "the system does not give this process AMX";
+}
+
+/* Turns 16 rows of 16 numbers of 32 bits. */
+WITH_AVX512 static inline void turn(__m512i r[16]) {
+  __m512i t[16];
+  for (int i = 0; i < 16; i += 2) {
+    t[i] = _mm512_unpacklo_epi32(r[i], r[i + 1]);
+    t[i + 1] = _mm512_unpackhi_epi32(r[i], r[i + 1]);
+  }
+  for (int i = 0; i < 16; i += 4) {
+    r[i] = _mm512_unpacklo_epi64(t[i], t[i + 2]);
+    r[i + 1] = _mm512_unpackhi_epi64(t[i], t[i + 2]);
+    r[i + 2] = _mm512_unpacklo_epi64(t[i + 1], t[i + 3]);
+    r[i + 3] = _mm512_unpackhi_epi64(t[i + 1], t[i + 3]);
+  }
+  for (int i = 0; i < 4; ++i) {
+    t[i] = _mm512_shuffle_i32x4(r[i], r[i + 4], 0x88);
+    t[i + 4] = _mm512_shuffle_i32x4(r[i], r[i + 4], 0xdd);
+    t[i + 8] = _mm512_shuffle_i32x4(r[i + 8], r[i + 12], 0x88);
+    t[i + 12] = _mm512_shuffle_i32x4(r[i + 8], r[i + 12], 0xdd);
+  }
+  for (int i = 0; i < 8; ++i) {
+    r[i] = _mm512_shuffle_i32x4(t[i], t[i + 8], 0x88);
+    r[i + 8] = _mm512_shuffle_i32x4(t[i], t[i + 8], 0xdd);
+  }
+}
+
+/* Lays out one tile: pairs of the sum's numbers stand side by side; in rows of `across` where `by_row`, as the left
+ * factor's, else of pairs, as the right one's. What lies beyond the factor is 0. */
+WITH_AVX512 static inline void lay_out(uint16_t* to, const Factor* from, int64_t across, int64_t along, int by_row) {
+  const int64_t wide = from->across - across < ROWS ? from->across - across : ROWS;
+  const int64_t deep = from->along - along < DEPTH ? from->along - along : DEPTH;
+  const int64_t stride = from->along_first ? from->across : from->along;
+  __m512i lines[16]; /* of 16 pairs each */
+  if (from->along_first) { /* a row of memory has one number of each pair: line p is of pair p, over `across` */
+    const __m512i halves = _mm512_set_epi16(31, 15, 30, 14, 29, 13, 28, 12, 27, 11, 26, 10, 25, 9, 24, 8, 23, 7, 22, 6,
+                                            21, 5, 20, 4, 19, 3, 18, 2, 17, 1, 16, 0);
+    const __mmask16 some = (__mmask16)((1u << wide) - 1u);
+    const float* row = from->data + along * stride + across;
+    for (int p = 0; p < 16; ++p) {
+      const __m512 first = 2 * p < deep ? _mm512_maskz_loadu_ps(some, row + 2 * p * stride) : _mm512_setzero_ps();
+      const __m512 second =
+          2 * p + 1 < deep ? _mm512_maskz_loadu_ps(some, row + (2 * p + 1) * stride) : _mm512_setzero_ps();
+      lines[p] = _mm512_permutexvar_epi16(halves, (__m512i)_mm512_cvtne2ps_pbh(second, first));
+    }
+  } else { /* a row of memory has whole pairs: line i is of row i, over the pairs */
+    const __mmask16 first_half = (__mmask16)((1u << (deep < 16 ? deep : 16)) - 1u);
+    const __mmask16 second_half = (__mmask16)(deep > 16 ? (1u << (deep - 16)) - 1u : 0u);
+    const float* row = from->data + across * stride + along;
+    for (int i = 0; i < 16; ++i) {
+      if (i < wide) {
+        const __m512 first = _mm512_maskz_loadu_ps(first_half, row + i * stride);
+        const __m512 second = _mm512_maskz_loadu_ps(second_half, row + i * stride + 16);
+        lines[i] = (__m512i)_mm512_cvtne2ps_pbh(second, first);
+      } else {
+        lines[i] = _mm512_setzero_si512();
+      }
+    }
+  }
+  if (from->along_first == by_row) turn(lines);
+  for (int i = 0; i < 16; ++i) _mm512_store_si512(to + 32 * i, lines[i]);
+}
+
+/* Adds 16 rows of 16 numbers to what stands there, or writes them where the sum begins; `high` and `wide` are in it. */
+WITH_AVX512 static inline void put(float* to, int64_t stride, const float* found, int64_t high, int64_t wide, int begins) {
+  const __mmask16 some = (__mmask16)(wide >= 16 ? 0xffffu : (1u << wide) - 1u);
+  for (int i = 0; i < 16 && i < high; ++i) {
+    __m512 row = _mm512_load_ps(found + 16 * i);
+    if (!begins) row = _mm512_add_ps(row, _mm512_maskz_loadu_ps(some, to + i * stride));
+    _mm512_mask_storeu_ps(to + i * stride, some, row);
+  }
+}
+
+typedef struct {
+  uint8_t palette, start_row, reserved[14];
+  uint16_t bytes[16];
+  uint8_t rows[16];
+} __attribute__((packed)) Layout;
+
+/* Multiplies two tiles of rows by two of columns, `depth` tiles deep. */
+WITH_AMX static inline void multiply_tiles(float* found, const uint16_t* left, const uint16_t* right, int64_t depth,
+                                         int64_t left_step, int64_t right_step) {
+  _tile_zero(0);
+  _tile_zero(1);
+  _tile_zero(2);
+  _tile_zero(3);
+  for (int64_t k = 0; k < depth; ++k) {
+    _tile_loadd(4, left + k * TILE, 64);
+    _tile_loadd(5, left + left_step + k * TILE, 64);
+    _tile_loadd(6, right + k * TILE, 64);
+    _tile_loadd(7, right + right_step + k * TILE, 64);
+    _tile_dpbf16ps(0, 4, 6);
+    _tile_dpbf16ps(1, 4, 7);
+    _tile_dpbf16ps(2, 5, 6);
+    _tile_dpbf16ps(3, 5, 7);
+  }
+  _tile_stored(0, found, 64);
+  _tile_stored(1, found + 256, 64);
+  _tile_stored(2, found + 512, 64);
+  _tile_stored(3, found + 768, 64);
+}
+
+/* Kept in memory: GCC does not know that the instruction reads more than its first bytes. */
+static const Layout layout = {.palette = 1,
+                              .bytes = {64, 64, 64, 64, 64, 64, 64, 64},
+                              .rows = {16, 16, 16, 16, 16, 16, 16, 16}};
+
+/* Writes left times right to `to` [left.across, right.across]. */
+WITH_AMX static void multiply(const Factor* left, const Factor* right, float* to, uint16_t* scratch) {
+  const int64_t columns = (right->across + ROWS - 1) / ROWS, pairs = (columns + 1) / 2;
+  uint16_t* const rows = scratch; /* of two tiles of rows, then all of the right factor's */
+  uint16_t* const laid = scratch + 2 * BLOCK / DEPTH * TILE;
+  float found[1024] __attribute__((aligned(64)));
+  _tile_loadconfig(&layout);
+  for (int64_t from = 0; from < left->along; from += BLOCK) {
+    const int64_t end = left->along < from + BLOCK ? left->along : from + BLOCK;
+    const int64_t depth = (end - from + DEPTH - 1) / DEPTH;
+    for (int64_t j = 0; j < columns; ++j)
+      for (int64_t k = 0; k < depth; ++k)
+        lay_out(laid + (j * depth + k) * TILE, right, j * ROWS, from + k * DEPTH, 0);
+    if (columns & 1) memset(laid + columns * depth * TILE, 0, depth * TILE * sizeof(uint16_t));
+    for (int64_t i = 0; i < left->across; i += 2 * ROWS) {
+      const int second = i + ROWS < left->across;
+      for (int64_t k = 0; k < depth; ++k) {
+        lay_out(rows + k * TILE, left, i, from + k * DEPTH, 1);
+        if (second) lay_out(rows + (depth + k) * TILE, left, i + ROWS, from + k * DEPTH, 1);
+      }
+      for (int64_t j = 0; j < pairs; ++j) {
+        const uint16_t* pair = laid + 2 * j * depth * TILE;
+        multiply_tiles(found, rows, pair, depth, second ? depth * TILE : 0, depth * TILE);
+        for (int t = 0; t < 4; ++t) {
+          const int64_t down = i + (t >> 1) * ROWS, across = (2 * j + (t & 1)) * ROWS;
+          if (down < left->across && across < right->across)
+            put(to + down * right->across + across, right->across, found + 256 * t, left->across - down,
+                right->across - across, from == 0);
+        }
+      }
+    }
+  }
+  _tile_release();
+}
+
+/* Returns room that this thread keeps, of at least so many bytes; NULL if there is none. */
+static uint16_t* scratch_of(size_t bytes) {
+  static _Thread_local uint16_t* held;
+  static _Thread_local size_t size;
+  if (bytes > size) {
+    free(held);
+    held = aligned_alloc(64, bytes);
+    size = held ? bytes : 0;
+  }
+  return held;
+}
+
+/* Multiplies `many` pairs of factors, [along, across] or [across, along] each, that stand one after the other. */
+static int multiply_all(const Factor* left, const Factor* right, float* to, int64_t many) {
+  const int64_t columns = (right->across + 2 * ROWS - 1) / (2 * ROWS) * 2;
+  uint16_t* scratch = scratch_of((size_t)((2 + columns) * (BLOCK / DEPTH) * TILE) * sizeof(uint16_t));
+  if (!scratch) return 0;
+  Factor first = *left, second = *right;
+  for (int64_t i = 0; i < many; ++i) {
+    multiply(&first, &second, to, scratch);
+    first.data += first.across * first.along;
+    second.data += second.across * second.along;
+    to += first.across * second.across;
+  }
+  return 1;
+}
+
+const char* edqn_unusable_products(void) { return find_fault(); }
+
+/* Returns a factor [..., along, across] or [..., across, along]. */
+static Factor factor_of(const XLA_FFI_Buffer* buffer, int along_first) {
+  const int64_t *dims = buffer->dims + buffer->rank - 2, along = dims[!along_first], across = dims[along_first];
+  const Factor factor = {buffer->data, across, along, along_first};
+  return factor;
+}
+
+static XLA_FFI_Error* product(XLA_FFI_CallFrame* call, int left_along_first, int right_along_first) {
+  if (asked_for_version(call)) return 0;
+  const XLA_FFI_Buffer *a = call->args.args[0], *b = call->args.args[1], *to = call->rets.rets[0];
+  const Factor left = factor_of(a, left_along_first), right = factor_of(b, right_along_first);
+  int64_t many = 1;
+  for (int64_t i = 0; i < to->rank - 2; ++i) many *= to->dims[i];
+  if (!multiply_all(&left, &right, to->data, many))
+    return failed(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED, "products.c has no memory for its tiles");
+  return 0;
+}
+
+/* [..., M, K] times [..., K, N]. */
+XLA_FFI_Error* edqn_product(XLA_FFI_CallFrame* call) { return product(call, 0, 1); }
+
+/* [..., M, N] times [..., K, N] turned: the gradient of the rows. */
+XLA_FFI_Error* edqn_product_by_turned(XLA_FFI_CallFrame* call) { return product(call, 0, 0); }
+
+/* [..., M, K] turned times [..., M, N]: the gradient of the kernel. */
+XLA_FFI_Error* edqn_product_of_turned(XLA_FFI_CallFrame* call) { return product(call, 1, 1); }
+
+#endif
