@@ -171,6 +171,7 @@ def recording_figures(recording: Recording) -> dict[str, Any]:
         "left_out": recording.left_out,
         "longest_pause_s": recording.longest_pause_s,
         "contrast": recording.contrast,
+        "pictures": 0 if recording.pictures is None else len(recording.pictures.images),
         "has_flight": recording.flight is not None,
     }
 
@@ -199,6 +200,8 @@ def recording_table(figures: dict[str, Any]) -> Table:
         table.add_row("longest pause", f"{figures['longest_pause_s']:.3f} s without an event")
     if figures["contrast"] is not None:
         table.add_row("contrast per event", f"{figures['contrast']:g}")
+    if figures["pictures"]:
+        table.add_row("pictures", f"{figures['pictures']:,}")
     if figures["has_flight"]:
         table.add_row("poses of the camera", "yes")
     if "seen" in figures:
@@ -247,7 +250,7 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
     if args.picture is None:
         return [], [], period_s
 
-    from edqn_jax.report.images import EVENTS, NEARNESS, RECONSTRUCTED_EVENTS
+    from edqn_jax.report.images import EVENTS, NEARNESS, PHOTOGRAPH, RECONSTRUCTED_EVENTS
     from edqn_jax.report.recordings import MAX_FRAMES, MOMENTS, Strip, pick_windows
 
     most = MAX_FRAMES if args.picture.suffix.lower() == ".gif" else MOMENTS
@@ -260,6 +263,9 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
         strips.append(Strip(f"policy sees,\n{width} × {height}", seen.image[chosen], EVENTS))
         name, look = ("decoded nearness", NEARNESS) if seen.has_nearness else ("decoded events", RECONSTRUCTED_EVENTS)
         strips.append(Strip(name, seen.decoded[chosen], look))
+    if recording.pictures is not None:
+        taken = np.stack([recording.pictures.newest(int(ends[number])) for number in chosen])
+        strips.append(Strip("camera's picture", taken, PHOTOGRAPH))
     return strips, [float(ends[number] - begin) * 1e-6 for number in chosen], period_s
 
 

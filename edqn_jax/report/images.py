@@ -38,6 +38,9 @@ def look_of(sensor: str) -> Look:
 
 EVENTS, NEARNESS = look_of("events"), look_of("depth")
 
+PHOTOGRAPH = Look("picture", "brightness of 255", "gray")
+"""A picture that a camera took beside its events."""
+
 RECONSTRUCTED_EVENTS = Look("events", "events per pixel\n(ON + OFF)", COUNTS)
 """The VAE's reconstruction of events, as their number per pixel, whatever the sign."""
 

@@ -61,7 +61,11 @@ def test_what_is_not_finite_stays_so() -> None:
     x, kernel = numbers(0, 40, 64), np.abs(numbers(1, 64, 40))
     x[7, 3], x[9, 5] = np.nan, np.inf
     found = np.asarray(rounded_matmul(x, kernel))
-    assert np.all(np.isnan(found[7])) and np.all(np.isposinf(found[9])) and np.all(np.isfinite(np.delete(found, (7, 9), 0)))
+    assert (
+        np.all(np.isnan(found[7]))
+        and np.all(np.isposinf(found[9]))
+        and np.all(np.isfinite(np.delete(found, (7, 9), 0)))
+    )
 
 
 def test_a_network_is_rounded_where_it_is_asked_for_alone() -> None:

@@ -4,7 +4,7 @@
     flatbuffer with its length before it: compression, place of the table at the end, description of the streams in XML
     packets: stream int32, length int32, flatbuffer (compressed) with its length before it, of events of 16 bytes
 
-Times are read as they stand, in the file's order: faery moves a time that runs back to the one before it.
+A packet of pictures holds one, with the begin and end of its exposure. Times are read as they stand, in the file's order: faery moves a time that runs back to the one before it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require_extra
-from edqn_jax.interop.recordings.recording import Recording, recording_of
+from edqn_jax.interop.recordings.recording import Pictures, Recording, recording_of
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 
@@ -29,17 +29,30 @@ EVENT = np.dtype(
 )
 
 
+EVENTS, PICTURES = "EVTS", "FRME"
+"""Kinds of streams that are read."""
+
+CHANNELS = {0: 1, 16: 3, 24: 4}
+"""Of a picture of 8 bits, by its format: grey, BGR, BGRA, as OpenCV numbers them."""
+
+BGR = np.array([0.114, 0.587, 0.299])
+"""Weights of the paper's Eq. 1."""
+
+
 class Stream(NamedTuple):
-    """A stream of events in a file."""
+    """A stream of a file."""
 
     number: int
+    kind: str
     name: str
+    source: str
+    """Name of the camera."""
     size: tuple[int, int] | None
     """Width and height of its image; None where the file does not say them."""
 
 
 def read_aedat4(file: Path, size: tuple[int, int] | None = None, number: int | None = None) -> Recording:
-    """Returns the recording of an AEDAT4.
+    """Returns the recording of an AEDAT4, with the pictures of the same camera.
 
     Args:
         file: to read.
@@ -55,9 +68,15 @@ def read_aedat4(file: Path, size: tuple[int, int] | None = None, number: int | N
         raise ConfigError(f"'{file}' does not begin as an AEDAT4 does: it is damaged, or of another kind")
     try:
         compression, end, streams, begin = _header(content)
-        stream = _select_stream(file, streams, number)
+        stream = _select_stream(file, [each for each in streams if each.kind == EVENTS], number)
         decompress = _decompressor(file, compression)
         packets = [_events(decompress(packet)) for packet in _packets(content, begin, end, stream.number)]
+        taken = [
+            _picture(decompress(packet))
+            for each in streams
+            if each.kind == PICTURES and each.source == stream.source
+            for packet in _packets(content, begin, end, each.number)
+        ]
     except (struct.error, ValueError, ElementTree.ParseError, RuntimeError, MemoryError, KeyError) as error:
         if isinstance(error, ConfigError):
             raise
@@ -72,11 +91,18 @@ def read_aedat4(file: Path, size: tuple[int, int] | None = None, number: int | N
         size=stream.size or size,
         time_unit="us",
         says_unit="us, as AEDAT4 has it",
+        pictures=_in_order(taken),
     )
 
 
+def _in_order(taken: list[tuple[int, NDArray[np.uint8]]]) -> Pictures | None:
+    """Returns pictures in the order of their times; None where there are none."""
+    taken = sorted(taken, key=lambda each: each[0])
+    return Pictures(np.array([until for until, _ in taken], np.int64), [each for _, each in taken]) if taken else None
+
+
 def _header(content: bytes) -> tuple[int, int, list[Stream], int]:
-    """Returns compression, where packets end, the streams of events and where packets begin."""
+    """Returns compression, where packets end, the streams and where packets begin."""
     at = len(MAGIC)
     begin = at + 4 + struct.unpack_from("<I", content, at)[0]
     root = at + 4 + struct.unpack_from("<I", content, at + 4)[0]
@@ -93,10 +119,11 @@ def _streams(described: ElementTree.Element) -> list[Stream]:
     found = []
     for node in described.iterfind("node[@name='outInfo']/node"):
         said = {attribute.get("key"): attribute.text or "" for attribute in node.iter("attr")}
-        if said.get("typeIdentifier") == "EVTS":
-            name, sides = said.get("originalOutputName", ""), (said.get("sizeX"), said.get("sizeY"))
+        kind, name, source = (said.get(key, "") for key in ("typeIdentifier", "originalOutputName", "source"))
+        if kind in (EVENTS, PICTURES):
+            sides = said.get("sizeX"), said.get("sizeY")
             size = (int(sides[0]), int(sides[1])) if sides[0] and sides[1] else None
-            found.append(Stream(int(node.attrib["name"]), name, size))
+            found.append(Stream(int(node.attrib["name"]), kind, name, source, size))
     return found
 
 
@@ -174,6 +201,26 @@ def _events(packet: bytes) -> NDArray:
     vector += struct.unpack_from("<I", packet, vector)[0]
     number = struct.unpack_from("<I", packet, vector)[0]
     return np.frombuffer(packet, EVENT, number, vector + 4)
+
+
+def _picture(packet: bytes) -> tuple[int, NDArray[np.uint8]]:
+    """Returns the end of the exposure, µs, and the picture [H, W] of an unpacked packet.
+
+    Raises:
+        ValueError: if it holds no picture, or one that is not of 8 bits.
+    """
+    root = 4 + struct.unpack_from("<I", packet, 4)[0]
+    if packet[8:12] != b"FRME":
+        raise ValueError("a packet of its stream of pictures holds something else")
+    time, end = _field(packet, root, 0, "<q", 0), _field(packet, root, 4, "<q", 0)
+    form, width, height = (_field(packet, root, *each, 0) for each in ((5, "<b"), (6, "<h"), (7, "<h")))
+    if form not in CHANNELS:
+        raise ValueError(f"its pictures are of a format, {form}, that is not read")
+    vector = root + _offset(packet, root, 10)
+    vector += struct.unpack_from("<I", packet, vector)[0]
+    size = height, width, CHANNELS[form]
+    pixels = np.frombuffer(packet, np.uint8, height * width * size[2], vector + 4).reshape(size)
+    return end or time, pixels[..., 0] if form == 0 else np.rint(pixels[..., :3] @ BGR).astype(np.uint8)
 
 
 def _offset(buffer: bytes, table: int, field: int) -> int:

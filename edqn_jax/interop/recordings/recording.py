@@ -8,7 +8,7 @@ plausible; otherwise it is refused with a sentence that names the option to give
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -51,6 +51,20 @@ MAX_PIXELS = 2**16
 
 
 @dataclasses.dataclass(frozen=True)
+class Pictures:
+    """Pictures that the camera took beside its events."""
+
+    until_us: NDArray[np.int64]
+    """[P] end of each exposure, on the events' clock, in order."""
+    images: Sequence[NDArray[np.uint8]]
+    """P of [H, W], grey."""
+
+    def newest(self, end_us: int) -> NDArray[np.uint8]:
+        """Returns the last picture [H, W] that was taken by a moment; before there is one, the first."""
+        return self.images[max(int(np.searchsorted(self.until_us, end_us, side="right")) - 1, 0)]
+
+
+@dataclasses.dataclass(frozen=True)
 class Recording:
     """Events with all that is known of the camera that made them."""
 
@@ -71,6 +85,8 @@ class Recording:
     """Events of a camera's file that stand before its first words of time and row, and have none."""
     contrast: float | None = None
     """Change of log brightness that made an event; None where it is not known."""
+    pictures: Pictures | None = None
+    """None where the file has none."""
     flight: Mapping[str, NDArray] | None = None
     """Where the camera was: `t` [T] microseconds, `position` [T, 3], `quaternion` [T, 4], `velocity` [T, 3], `move`
     [T, 3] of the decision that was being flown, of other actions than moves the direction that was commanded, and their
