@@ -103,8 +103,8 @@ def ensure_registered(
     """Loads a source's library and registers its handlers with XLA; returns whether that was possible.
 
     It is the one that the package brings; where there is none, or CC names a compiler, it is compiled here. Where that
-    was not possible, a warning says why. A source NAME.c may export `edqn_unusable_NAME`, which returns why it cannot be
-    used on this machine, or a null pointer.
+    was not possible, a warning says why. A source NAME.c may export `edqn_unusable_NAME`, which returns why it cannot
+    be used on this machine, or a null pointer.
 
     Args:
         source: C, with XLA's header for foreign functions.

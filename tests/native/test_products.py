@@ -24,7 +24,7 @@ def numbers(seed: int, *shape: int) -> np.ndarray:
 
 
 def assert_close(found: Any, left: Any, right: Any) -> None:
-    """Holds a product against the rounded factors'; sums of float32 differ by rounding from those in double precision."""
+    """Holds a product against that of rounded factors in double precision; sums in float32 round, too."""
     size = np.abs(to_bfloat16(left)) @ np.abs(to_bfloat16(right))
     assert np.all(np.abs(np.asarray(found, np.float64) - product(left, right)) <= 2e-6 * size)
 

@@ -4,7 +4,9 @@
     flatbuffer with its length before it: compression, place of the table at the end, description of the streams in XML
     packets: stream int32, length int32, flatbuffer (compressed) with its length before it, of events of 16 bytes
 
-A packet of pictures holds one, with the begin and end of its exposure. Times are read as they stand, in the file's order: faery moves a time that runs back to the one before it.
+A packet of pictures holds one, with begin and end of its exposure.
+
+Times are read as they stand, in the file's order: faery moves a time that runs back to the one before it.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def init_params(module: Any, name: str, key: Array, **inputs: Any) -> Any:
 
 
 def matmul(x: Array, kernel: Array) -> Array:
-    """Returns `x @ kernel`, `[..., F]`, of rows `[..., K]` and a kernel `[K, F]`, in the precision of what is traced."""
+    """Returns `x @ kernel`, `[..., F]`, of rows `[..., K]` and a kernel `[K, F]`, as `in_precision` has them."""
     return rounded_matmul(x, kernel) if are_rounded() else shared_matmul(x, kernel)
 
 
