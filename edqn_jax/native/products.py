@@ -29,10 +29,17 @@ LEAST_SIDE = 16
 _ROUNDED = contextvars.ContextVar("products are taken in bfloat16", default=False)
 
 
+def precision_of(name: str) -> str:
+    """Returns the type of factors that `train.products` names: float32 or bfloat16, which `auto` is where AMX is."""
+    if name == "auto":
+        return "bfloat16" if is_available() else "float32"
+    return name
+
+
 @contextlib.contextmanager
 def in_precision(name: str) -> Iterator[None]:
-    """Takes products of layers that are traced within as `train.products` says: float32, bfloat16 or auto."""
-    token = _ROUNDED.set(name == "bfloat16" or (name == "auto" and is_available()))
+    """Takes products of layers that are traced within as `train.products` says."""
+    token = _ROUNDED.set(precision_of(name) == "bfloat16")
     try:
         yield
     finally:

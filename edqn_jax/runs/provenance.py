@@ -22,6 +22,7 @@ from edqn_jax.devices import processes
 from edqn_jax.learn.perception.embedding import has_code
 from edqn_jax.learn.state import TrainState
 from edqn_jax.native import build
+from edqn_jax.native.products import precision_of
 from edqn_jax.sim.scene.scene import Scene, obstacle_count
 from edqn_jax.sim.sensors.sensor import frames_per_decision
 from edqn_jax.sim.task.reward import Reward
@@ -43,6 +44,7 @@ def describe_workload(config: Config, scene: Scene) -> dict[str, Any]:
             config.encoder.batch_size / envs if config.encoder.keep_learning and has_code(config) else 0.0
         ),
         "num_envs": envs,
+        "products": precision_of(config.train.products),
         "physics": config.drone.physics,
     }
 
