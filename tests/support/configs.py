@@ -37,7 +37,8 @@ TINY = Config(
         learning_starts=64,
         replay_size=512,
     ),
-    train=TrainConfig(num_envs=16, chunk_steps=4, total_steps=256),
+    # The same numbers on every processor.
+    train=TrainConfig(num_envs=16, chunk_steps=4, total_steps=256, products="float32"),
 )
 """For `miniature_world`."""
 

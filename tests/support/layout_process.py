@@ -52,7 +52,7 @@ CONFIG = Config(
         exploration_start=0.3,
         exploration_end=0.3,
     ),
-    train=TrainConfig(num_envs=64, chunk_steps=1, total_steps=64 * 64),
+    train=TrainConfig(num_envs=64, chunk_steps=1, total_steps=64 * 64, products="float32"),
 )
 """A chunk is one step, so the number that it is given says what is done in it (`Schedule`): the first step is the
 warm-up, in which the VAE learns, the next ones only fly, and from `learn_from` on the DQN learns.
