@@ -29,7 +29,7 @@ from edqn_jax.sim.physics.drone import Flight, yaw_of
 from edqn_jax.sim.scene.distance import shape_distances, signed_distance
 from edqn_jax.sim.scene.scene import Scene, absent_like, scene_at
 from edqn_jax.sim.sensors import sensor
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome

@@ -15,7 +15,7 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 
 
 @pytest.fixture(scope="module")
