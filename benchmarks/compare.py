@@ -247,7 +247,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, list[s
     Raises:
         ConfigError: if a row is unknown, the options after -- are invalid, or the file cannot be written.
     """
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("compare", __doc__, epilog="All rows take about five minutes on two cores.")
     parser.add_argument("a", metavar="COMMIT_A", help="the commit to compare with")
     parser.add_argument("b", metavar="COMMIT_B", help="the commit to compare")

@@ -43,7 +43,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     Raises:
         ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("conventional", __doc__)
     parser.add_argument(
         "--decisions", type=at_least_one, default=DECISIONS, help=f"decisions of each turn (default {DECISIONS})"

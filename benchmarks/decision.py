@@ -12,7 +12,6 @@ Arguments after -- are options of train.py. Parameters are untrained, which does
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import sys
 from collections.abc import Sequence
@@ -27,6 +26,7 @@ from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.command import Parser, in_a_sentence
+from measurement.cores import keep_to, own_cores
 from measurement.flags import parse_config, split
 
 REPEATS, CALLS = 5, 2000
@@ -38,7 +38,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     Raises:
         ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("decision", __doc__)
     parser.add_argument("--quick", action="store_true", help=f"{CALLS // 10} decisions instead of {REPEATS} x {CALLS}")
     args = parser.parse(words)
@@ -67,8 +67,7 @@ def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
     args, config = parse(argv)
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX starts its threads
+    keep_to(own_cores()[:1])  # before JAX starts its threads
     report = measure(config, *((1, CALLS // 10) if args.quick else (REPEATS, CALLS)))
     row = report["rows"][0]
     print(

@@ -10,7 +10,6 @@ command. Packets are those of a simulated flight, at the resolution of a camera.
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 import sys
 import tempfile
@@ -35,6 +34,7 @@ from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.command import Parser, in_a_sentence
+from measurement.cores import keep_to, own_cores
 
 REPEATS, CALLS = 5, 2000
 
@@ -120,8 +120,7 @@ def _seconds(runner: Runner, given: list[tuple[np.ndarray, int, dict[str, Any]]]
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
     args = parse(argv)
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX and onnxruntime start their threads
+    keep_to(own_cores()[:1])  # before JAX and onnxruntime start their threads
     camera = None if args.camera is None else (args.camera[0], args.camera[1])
     report = measure(load_policy(args.run), camera, *((1, CALLS // 10) if args.quick else (REPEATS, CALLS)))
     row = report["rows"][0]

@@ -19,22 +19,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.evaluation.flight_scene import scene_of_flight
-from edqn_jax.evaluation.missions import MissionSet, load_missions
-from edqn_jax.evaluation.rollouts import fly_on_all_devices
-from edqn_jax.runs.policies import load_run
+from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics.drone import Flight, yaw_of
 from edqn_jax.sim.scene.distance import shape_distances, signed_distance
 from edqn_jax.sim.scene.scene import Scene, absent_like, scene_at
 from edqn_jax.sim.sensors import sensor
-from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task import group
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
+from measurement.recorded import fly_recorded
 
 NAMES = {
     "boxes": "block",
@@ -200,11 +197,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_flights("folder of a run, or pretrained", missions=1000)
     parser.add_argument("--flights", type=at_least_one, default=50, help="most collisions to look at (default 50)")
     args = parser.parse(argv)
-    use_cpu_devices()
-    config, params = load_run(args.run)
-    group.check_alone(config, "this benchmark")
-    missions = load_missions(config, args.world or config.world.name, args.missions, args.seed)
-    flights = jax.tree.map(np.asarray, fly_on_all_devices(config, missions.env_params, params, args.seed, record=True))
+    config, missions, flown = fly_recorded(args)
+    flights = jax.tree.map(np.asarray, flown)
     (collided,) = np.nonzero(flights.outcome == Outcome.COLLISION)
     rows = [look_back(config, missions, flights, int(mission)) for mission in collided[: args.flights]]
     counts = Counter(Outcome(int(kind)).name.lower() for kind in flights.outcome)

@@ -76,7 +76,7 @@ def outcomes(config: Config, world: EnvParams, gate: str, key: Array) -> Array:
 @in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0; 2 for invalid input."""
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("gates", __doc__, json="write the rows to this file")
     parser.add_argument("--world", default="moving", choices=FAMILIES, help="(default moving)")
     parser.add_argument("--missions", type=at_least_one, default=1000, help="test missions (default 1000)")

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -43,7 +42,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     Raises:
         ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("interop", __doc__)
     parser.add_argument("--num-envs", type=at_least_one, default=DRONES, help=f"drones of a vector (default {DRONES})")
     parser.add_argument("--steps", type=at_least_one, default=STEPS, help=f"steps of a turn (default {STEPS})")

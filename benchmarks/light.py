@@ -46,7 +46,7 @@ SENSORS: dict[str, tuple[str, ...]] = {
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Returns the parsed arguments; `flags` are those after --."""
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("light", __doc__, json=None)
     lights = [0.1, 1.0, 10.0, 100.0, 1000.0, 10_000.0]
     parser.add_argument("--out", type=Path, required=True, help="folder of rows and policies")

@@ -52,7 +52,7 @@ QUICK = ("--total-steps", "49152", "--encoder.warmup-decisions", "16384")
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Returns the parsed arguments; `flags` are those after --, for train.py."""
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("mission", __doc__)
     parser.add_argument("--seeds", type=at_least_one, default=20, help="number of seeds (default 20)")
     parser.add_argument("--first-seed", type=int, default=0, help="the first seed (default 0)")

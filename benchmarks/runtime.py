@@ -89,7 +89,7 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     Raises:
         ConfigError: if a method or world is unknown, options are invalid, or a file cannot be read or written.
     """
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("runtime", __doc__)
     parser.add_argument(
         "--quick", action="store_true", help="60 000 decisions, two seeds, the paper's world: learners do not converge"

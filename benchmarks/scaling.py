@@ -291,7 +291,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     Raises:
         ConfigError: if the options after -- are invalid, or a file cannot be written.
     """
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("scaling", __doc__)
     parser.add_argument("--quick", action="store_true", help="fewer sizes and shorter turns")
     parser.add_argument(

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -34,7 +33,7 @@ from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, frames_per_decision, sense
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.env import EnvParams
@@ -43,6 +42,7 @@ from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
+from measurement.cores import keep_to, own_cores
 from measurement.intervals import median_interval
 
 SENSORS = ("events", "frames", "frame-pair")
@@ -184,8 +184,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
     args = parse(argv)
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX starts its threads
+    keep_to(own_cores()[:1])  # before JAX starts its threads
     policy = load_policy(args.policy)
     if policy.config.env.sensor != "events":
         raise ConfigError(f"'{args.policy}' sees {policy.config.env.sensor}; --policy must be one that sees events")

@@ -70,7 +70,7 @@ FIRST_ROW_S = 240.0
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Returns the parsed arguments; `flags` are those after --."""
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("success", __doc__, json=None)
     worlds = ["sparse", "medium", "dense"]
     parser.add_argument("--out", type=Path, required=True, help="folder of rows and policies")
@@ -396,7 +396,9 @@ def measure(wanted: Sequence[Wanted], rows: list[Row], until: float, first_row_s
 
 @contextlib.contextmanager
 def _claim(file: Path) -> Iterator[bool]:
-    """Yields whether this process may measure the row of a file; the claim ends with the process, however that ends."""
+    """Yields whether this process may train and measure a file's row; the claim ends with the process, however that
+    ends.
+    """
     lock = filelock.FileLock(file.with_name(file.name + ".lock"), blocking=False)
     try:
         lock.acquire()
@@ -410,7 +412,10 @@ def _claim(file: Path) -> Iterator[bool]:
 
 
 def train_all(wanted: Sequence[Wanted], until: float) -> None:
-    """Trains the rows that are not written yet, one after the other, while there is time for one more."""
+    """Trains the rows that are not written yet, one after the other, while there is time for one more.
+
+    A row that another process trains or measures is left to it.
+    """
     took: list[float] = []
     for one in wanted:
         if one.train is None or one.file.is_file() or (policies_of(one.file) / TRAINED).is_file():
@@ -419,7 +424,11 @@ def train_all(wanted: Sequence[Wanted], until: float) -> None:
         if began + max(took, default=FIRST_ROW_S) > until:
             print("trainings are left; the same command goes on with them", file=sys.stderr)
             return
-        one.train()
+        one.file.parent.mkdir(parents=True, exist_ok=True)
+        with _claim(one.file) as is_ours:
+            if not is_ours or (policies_of(one.file) / TRAINED).is_file():
+                continue
+            one.train()
         took.append(time.perf_counter() - began)
         print(f"{policies_of(one.file)}: trained, {took[-1]:.0f} s", file=sys.stderr)
 

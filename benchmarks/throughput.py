@@ -55,7 +55,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     Raises:
         ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("throughput", __doc__)
     parser.add_argument("--repeats", type=at_least_one, default=REPEATS, help=f"turns of each row (default {REPEATS})")
     parser.add_argument("--quick", action="store_true", help="one short turn of each row")

@@ -52,7 +52,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     Raises:
         ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("tutorial", __doc__)
     parser.add_argument(
         "--drones", type=at_least_one, default=DRONES, help=f"environments of the tutorials (default {DRONES})"

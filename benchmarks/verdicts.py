@@ -17,15 +17,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from edqn_jax.devices.devices import use_cpu_devices
-from edqn_jax.evaluation.missions import load_missions
-from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement, check_verdicts
-from edqn_jax.runs.policies import load_run
-from edqn_jax.sim.task import group
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
 from measurement.command import Parser, in_a_sentence
+from measurement.recorded import fly_recorded
 
 
 def rows_of(results: list[Agreement]) -> list[dict[str, Any]]:
@@ -69,11 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = Parser("verdicts", __doc__)
     parser.add_flights("folder of a run", missions=200)
     args = parser.parse(argv)
-    use_cpu_devices()
-    config, params = load_run(args.run)
-    group.check_alone(config, "this benchmark")
-    course = load_missions(config, args.world or config.world.name, args.missions, args.seed)
-    flights = fly_on_all_devices(config, course.env_params, params, args.seed, record=True)
+    config, course, flights = fly_recorded(args)
     results = check_verdicts(config, course, flights)
     rows = rows_of(results)
     print(table(rows))

@@ -16,7 +16,6 @@ import contextlib
 import dataclasses
 import multiprocessing
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -39,6 +38,7 @@ from edqn_jax.fly.link import Link
 from edqn_jax.fly.pilot import GAP_S, Pilot, Report, Task
 from edqn_jax.fly.records import FlightLog
 from edqn_jax.fly.simulated.camera import EventCamera, EventServer
+from edqn_jax.fly.simulated.ports import hold_udp_port
 from edqn_jax.fly.streams import EVENT, SocketStream
 from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.interop.deployment.runner import Runner
@@ -51,6 +51,7 @@ from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.environment import make
 from measurement import json_report
 from measurement.command import Parser, in_a_sentence
+from measurement.cores import keep_to, own_cores
 
 WORLD = "medium"
 """Where the camera flies: the first test world."""
@@ -84,20 +85,9 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     args = parser.parse(argv)
     if min(args.minutes, args.seen, args.pace) <= 0.0 or args.pace > 1.0 or min(args.camera) < 1:
         raise ConfigError("--minutes, --seen and --pace must be above 0, --pace at most 1, --camera's sides at least 1")
-    if len(cores()) < 2:
+    if len(own_cores()) < 2:
         raise ConfigError("vehicle and camera need a core beside the pilot's, and this process may use one alone")
     return args
-
-
-def cores() -> list[int]:
-    """Returns the numbers of the cores that this process may use."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-
-
-def keep_to(chosen: Sequence[int]) -> None:
-    """Keeps this process, and those that it starts, to these cores, where the system can."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, set(chosen))
 
 
 def come_first() -> None:
@@ -172,12 +162,11 @@ def others(
         camera = fresh.Process(target=stream, args=(folder / "seen.npz", size, chosen, first, there), daemon=True)
         camera.start()
         stack.callback(camera.terminate)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            port = probe.getsockname()[1]
+        port, let_go = hold_udp_port()
+        stack.callback(let_go)
         vehicle = ["-m", "edqn_jax.fly.simulated.vehicle", "--mavlink", f"udpout:127.0.0.1:{port}"]
         programs = [vehicle, *([["-c", BUSY]] * len(chosen) if busy else [])]
-        own = cores()
+        own = own_cores()
         keep_to(chosen)  # so that the programs are kept there, too
         for words in programs:
             program = subprocess.Popen([sys.executable, *words])
@@ -186,6 +175,7 @@ def others(
         keep_to(own)
         if not here.poll(60.0):
             raise ConfigError("the camera's process did not start")
+        let_go()
         yield f"udpin:127.0.0.1:{port}", here.recv()
 
 
@@ -224,7 +214,7 @@ def measure(policy: Policy, args: argparse.Namespace) -> dict[str, Any]:
     packets = seen_packets(policy, size, args.seen)
     with tempfile.TemporaryDirectory() as folder:
         runner = Runner(export_policy(policy, Path(folder) / "policy.onnx").file, camera=size, contrast=CONTRAST)
-    pilot, *rest = cores()
+    pilot, *rest = own_cores()
     with others(packets, size, rest, busy=args.busy, first=args.first) as (vehicle, camera):
         keep_to([pilot])
         if args.first:

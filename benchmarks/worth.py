@@ -51,7 +51,7 @@ MISSIONS = {BYTES: 32}
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Returns the parsed arguments; `flags` are those after --."""
-    words, flags = split(sys.argv[1:] if argv is None else argv)
+    words, flags = split(argv)
     parser = Parser("worth", __doc__, json=None)
     parser.add_argument("--axis", choices=[*AXES, BYTES], help="whose rows are measured")
     parser.add_argument("--out", type=Path, required=True, help="folder of rows and policies")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import sys
 from collections.abc import Sequence
 
 from edqn_jax.cli.train import parse_train
@@ -17,9 +18,9 @@ ONE_LOOK = ("--surface.pattern", "plaid")
 """What is flown unless options say otherwise: the figures of the pages are of one plaid unless their row says more."""
 
 
-def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Returns the arguments of the benchmark, and those after --, which are options of train.py."""
-    words = list(words)
+def split(argv: Sequence[str] | None) -> tuple[list[str], list[str]]:
+    """Returns the arguments of the benchmark, by default the process's, and those after --: options of train.py."""
+    words = list(sys.argv[1:] if argv is None else argv)
     cut = words.index("--") if "--" in words else len(words)
     return words[:cut], words[cut + 1 :]
 

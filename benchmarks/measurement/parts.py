@@ -30,7 +30,7 @@ from edqn_jax.sim.physics.controller import rotor_thrusts
 from edqn_jax.sim.physics.drone import DroneState
 from edqn_jax.sim.physics.flight import fly_decision, physics_step
 from edqn_jax.sim.scene.scene import take_scene
-from edqn_jax.sim.sensors import events, sensor
+from edqn_jax.sim.sensors import event_laws, sensor
 from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
 from edqn_jax.sim.task.env import EnvParams, EnvState, Step
 from edqn_jax.sim.task.outcomes import judge_decision
@@ -204,7 +204,7 @@ def sensing(now: Moment) -> Part:
     def body(_: None, carry):
         frames, memory, keys = carry
         field, memory = jax.vmap(
-            lambda f, m, k: events.generate_events(config.events, m, f, config.events.frame_times_s, k)
+            lambda f, m, k: event_laws.generate_events(config.events, m, f, config.events.frame_times_s, k)
         )(frames, memory, keys)
         return depending_on(frames, field), memory, keys
 

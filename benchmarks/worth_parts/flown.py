@@ -20,6 +20,7 @@ from edqn_jax.config.rules import validate
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
+from edqn_jax.policies.functions import actor_of
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.scene.surface import PATTERNS
 from edqn_jax.sim.task.env import EnvParams
@@ -68,6 +69,9 @@ def outcomes_of(
         layers: by condition, what is otherwise than in training.
         missions: in each condition; the same for all of them, and for all rows of a world.
         seed: of the test worlds: `missions` of them from the `seed` x `missions`-th on.
+
+    Raises:
+        ConfigError: if a condition is invalid, or the policies cannot fly in it.
     """
     groups: dict[Any, list[tuple[str, EnvParams]]] = {}
     for name, layer in layers.items():
@@ -80,7 +84,10 @@ def outcomes_of(
     found = {}
     for (flown, _), members in groups.items():
         names, course = [name for name, _ in members], join_courses([course for _, course in members])
-        of_policies = [fly_on_all_devices(flown, course, policy.params).outcome for policy in policies]
+        of_policies = [
+            fly_on_all_devices(flown, course, policy.params, actor=actor_of(policy, flown)).outcome
+            for policy in policies
+        ]
         by_seed = np.stack(of_policies).reshape(len(policies), len(names), missions)
         for number, name in enumerate(names):
             found[name] = ["".join(map(str, map(int, one))) for one in by_seed[:, number]]

@@ -32,7 +32,7 @@ from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, has_motion, scene_at
-from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors import event_laws, event_memory
 from edqn_jax.sim.sensors.sensor import render_view
 from measurement import json_report
 from measurement.flags import parse_options, with_test_worlds_only
@@ -191,8 +191,8 @@ def _count(config: Config, times: tuple[float, ...], scene: Scene, poses: Flight
     counts = []
     for number, contrast in enumerate(CONTRASTS):
         options = dataclasses.replace(config.events, contrast_on=contrast, contrast_off=contrast)
-        memory = events.reset_memory(options, camera.height, camera.width, jax.random.fold_in(begins, number))
-        field, _ = events.generate_events(options, memory, frames, times, jax.random.fold_in(noise, number))
+        memory = event_memory.reset_memory(options, camera.height, camera.width, jax.random.fold_in(begins, number))
+        field, _ = event_laws.generate_events(options, memory, frames, times, jax.random.fold_in(noise, number))
         counts.append(jnp.sum(field.count))
     return jnp.stack(counts)
 

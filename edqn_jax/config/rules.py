@@ -110,7 +110,7 @@ def _flight_rules(config: Config, trains: bool) -> Rules:
     held = env.actions != "body-rates" or not env.setpoint_m_s2
     yield held, "env.setpoint_m_s2", "0 with env.actions body-rates: no velocity is held"
     yield light.most_lux > 0 or not light.told, "light.told", "false without light.least_lux and light.most_lux"
-    exposed = exposure.real or not (light.told and env.sensor in ("frames", "frame-pair"))
+    exposed = exposure.real or not (light.told and SENSORS.get(env.sensor).exposes)
     yield exposed, "exposure.real", f"true with light.told and env.sensor {env.sensor}"
     yield from _event_sensor_rules(config.events)
     shortest = exposure.shortest_s <= exposure.longest_s

@@ -17,7 +17,7 @@ from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams
 from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.qnetwork import Params
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
 from edqn_jax.sim.task.observation import Observation
 

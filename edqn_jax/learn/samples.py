@@ -24,7 +24,7 @@ from edqn_jax.config import EncoderConfig
 from edqn_jax.keys import uniform_integers
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.vae import Target
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.sensors.sensor import flip_left_right
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.task import Task

@@ -17,11 +17,13 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import check_config, make_config, suggest_nearest
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.actor import Actor, AgentActor
+from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies import function_named
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task.action_sets import action_of, action_set, clip_action
 from edqn_jax.sim.task.env import Observation
+from edqn_jax.sim.task.observation import motion_size
 from edqn_jax.user_code import check_takes, load_module
 
 Function = Callable[[Observation, Any, Array], tuple[Any, Any]]
@@ -168,9 +170,20 @@ def config_of(policy: Policy | FunctionPolicy) -> Config:
 
 
 def actor_of(policy: Policy | FunctionPolicy, config: Config) -> Actor:
-    """Returns what flies a policy under a configuration, which may have other conditions than the policy's own."""
+    """Returns what flies a policy under a configuration, which may have other conditions than the policy's own.
+
+    Raises:
+        ConfigError: if its encoder would be given another number of values of the own motion than it knows.
+    """
     if isinstance(policy, FunctionPolicy):
         return FunctionActor(policy.function, policy.memory, config)
+    known, given = motion_size(policy.config), motion_size(config)
+    if known != given and embedding.has_code(config):
+        raise ConfigError(
+            f"this policy's encoder knows {known} values of the own motion and would be given {given}, with roll "
+            f"and pitch at each pose from which the sensor '{config.env.sensor}' looks, as camera.mount is body; "
+            "exposure.real, longest_s, rate_hz and latency_s must be those that it was trained with"
+        )
     return AgentActor(config)
 
 

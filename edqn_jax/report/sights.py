@@ -32,6 +32,7 @@ from edqn_jax.sim.task.observation import (
     Observation,
     heading_velocity,
     own_size,
+    repeat_pose,
     with_lean,
     with_told,
 )
@@ -100,28 +101,28 @@ class FlightRenderer:
         rows = decision_rows(self.config, trajectory)
         padded = np.pad(rows, ((0, self.config.env.max_decisions - len(rows)), (0, 0)), mode="edge")
         motions = own_motions(self.config, trajectory, padded)
-        found = self._shown.result()(
-            self.scene, params, *trajectory_poses(trajectory, padded), times_of(trajectory, padded), motions
-        )
-        return SensorImages(*(np.asarray(leaf)[: len(rows)] for leaf in found))
+        seen = (*trajectory_poses(trajectory, padded), times_of(trajectory, padded))
+        seen = [np.concatenate(pair) for pair in zip(start_poses(self.config, trajectory), seen, strict=True)]
+        found = self._shown.result()(self.scene, params, *seen, np.concatenate([motions[:1], motions]))
+        return SensorImages(*(np.asarray(leaf)[1 : len(rows) + 1] for leaf in found))
 
     def rgb(self, position: np.ndarray, quaternion: np.ndarray, time: npt.ArrayLike = 0.0) -> np.ndarray:
         """Returns the linear RGB [FINE H, FINE W, 3] of the drone's camera at a pose and a time, a ray per pixel."""
         return np.asarray(self._rgb.result()(self.scene, position, quaternion, np.asarray(time, np.float32)))
 
     def _compile_shown(self) -> Compiled:
-        config, decisions = self.config, self.config.env.max_decisions
+        config, observations = self.config, 1 + self.config.env.max_decisions
         looks = len(sensor.frame_steps(config))
         params = jax.eval_shape(lambda: fresh_policy(config)) if self._decodes else None
-        motion = jax.ShapeDtypeStruct((decisions, MOTION_SIZE), np.float32)
-        return _compiled(self._all_shown, self.scene, params, *_blank_poses(decisions, looks), motion)
+        motion = jax.ShapeDtypeStruct((observations, MOTION_SIZE), np.float32)
+        return _compiled(self._all_shown, self.scene, params, *_blank_poses(observations, looks), motion)
 
     def _all_shown(
         self, scene: Scene, params: PolicyParams | None, position: Array, quaternion: Array, time: Array, motion: Array
     ) -> _Images:
-        """The images of `shown` at [D, T, ...] poses and times with own motions of `own_motions`.
+        """The images of `shown` at the start and D decisions, [1 + D, T, ...] poses and times, with own motions.
 
-        The sensor carries its memory from each decision to the next.
+        The sensor carries its memory from each observation to the next, as in flight.
         """
         config, actor, shows = self.config, AgentActor(self.config), sensor.sensor_of(self.config)
         start, rest = jax.random.split(jax.random.key(0))
@@ -172,6 +173,22 @@ def decision_rows(config: Config, trajectory: Mapping[str, np.ndarray]) -> np.nd
     n, steps = config.drone.physics_steps, len(trajectory["t"])
     decisions = np.arange(max(steps // n, 1))[:, None]
     return np.clip(decisions * n + np.array(sensor.frame_steps(config)) - 1, 0, steps - 1)
+
+
+def start_poses(config: Config, trajectory: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+    """Returns positions [1, T, 3], attitudes [1, T, 4] and times [1, T] at which the sensor looks before a flight.
+
+    The drone is at rest. A trajectory begins after the first physics step, which moved it with the velocity at its end.
+    """
+    dt, first = config.drone.physics_dt_s, np.zeros(1, int)
+    steps = np.array(sensor.frame_steps(config)) - config.drone.physics_steps
+    (moved,), (quaternion,) = trajectory_poses(trajectory, first)
+    body = drone.hover_state(
+        jnp.asarray(moved - dt * columns_of(trajectory, VELOCITY)[0]), drone.yaw_of(jnp.asarray(quaternion))
+    )
+    here = repeat_pose(body, len(steps))
+    times = np.asarray(trajectory["t"])[0] + dt * (steps - 1.0)
+    return tuple(np.asarray(leaf, np.float32)[None] for leaf in (here.position, here.quaternion, times))
 
 
 def trajectory_poses(trajectory: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -32,8 +32,9 @@ from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world
 from edqn_jax.sim.scene.motion import Aim
 from edqn_jax.sim.scene.scene import Scene, scene_at
-from edqn_jax.sim.sensors import events, sensor
-from edqn_jax.sim.sensors.events import EventField, EventMemory
+from edqn_jax.sim.sensors import event_field, event_laws, sensor
+from edqn_jax.sim.sensors.event_field import EventField
+from edqn_jax.sim.sensors.event_memory import EventMemory
 from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.action_sets import action_of
 from edqn_jax.sim.task.env import EnvParams, EnvState, Step
@@ -121,7 +122,7 @@ class Environment:
         Raises:
             ConfigError: if the sensor is not the event camera.
         """
-        return events.to_stream(self._field(observation))
+        return event_field.to_stream(self._field(observation))
 
     @as_tested
     def event_image(self, observation: Observation) -> np.ndarray:
@@ -130,7 +131,7 @@ class Environment:
         Raises:
             ConfigError: if the sensor is not the event camera.
         """
-        return np.asarray(events.event_image(self._field(observation)))
+        return np.asarray(event_field.event_image(self._field(observation)))
 
     @as_tested
     def stream(
@@ -157,7 +158,7 @@ class Environment:
         """
         sees = dataclasses.replace(self.config, events=dataclasses.replace(self.config.events, law=law))
         scene = env.scene_of(self.world, jnp.asarray(mission), aim)
-        return events.to_stream(_stream(sees, scene, flight))
+        return event_field.to_stream(_stream(sees, scene, flight))
 
     @as_tested
     def picture(self, state: EnvState, scale: int = 8) -> Array:
@@ -254,7 +255,7 @@ def _stream(config: Config, scene: Scene, flight: Flight) -> EventField:
     key, noise = jax.random.split(jax.random.key(0))
     memory = SENSORS.get("events").at_rest(config, key)
     assert isinstance(memory, EventMemory)
-    return events.generate_events(config.events, memory, frames, times, noise, continuous=True)[0]
+    return event_laws.generate_events(config.events, memory, frames, times, noise, continuous=True)[0]
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -14,7 +14,7 @@ from conventional_stack import camera, events, task, world
 from edqn_jax.config import CameraConfig, Config, EncoderConfig, EventsConfig
 from edqn_jax.sim.camera import camera as our_camera
 from edqn_jax.sim.scene.distance import signed_distance
-from edqn_jax.sim.sensors import events as our_events
+from edqn_jax.sim.sensors import event_laws, event_memory
 from edqn_jax.sim.sensors import sensor as our_sensor
 from tests.oracles import camera_plain, event_fields, events_plain
 from tests.support.benchmarks.conventional_course import paper
@@ -162,9 +162,9 @@ def test_events_are_the_papers_law(change):
         plain[y, x] += p
     np.testing.assert_array_equal(counts, np.clip(plain, -127, 127))
     # And ours; its float32 logarithm may count one more or less where a change is a whole number of tolerances.
-    memory = our_events.reset_memory(config, before.shape[0], before.shape[1], jax.random.key(0))
+    memory = event_memory.reset_memory(config, before.shape[0], before.shape[1], jax.random.key(0))
     frames = jnp.asarray(np.stack([before, after]), jnp.float32)
-    field, _ = our_events.generate_events(config, memory, frames, config.frame_times_s, jax.random.key(0))
+    field, _ = event_laws.generate_events(config, memory, frames, config.frame_times_s, jax.random.key(0))
     assert np.mean(np.asarray(event_fields.signed_count(field)) != counts) < 0.02
 
 

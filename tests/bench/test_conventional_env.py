@@ -29,7 +29,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require_extra
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import DroneState
-from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors import event_memory
 from edqn_jax.sim.task import env, outcomes
 from edqn_jax.sim.task.env import EnvState
 from edqn_jax.sim.task.observation import MAX_YAW_RATE, own_state
@@ -69,7 +69,7 @@ def begun(bodies: DroneState, decision) -> EnvState:
         mission=jnp.arange(count),
         decision=jnp.asarray(decision, jnp.int32),
         ended=jnp.zeros(count, bool),
-        memory=events.reset_memory(CONFIG.events, CONFIG.camera.height, CONFIG.camera.width, jax.random.key(0)),
+        memory=event_memory.reset_memory(CONFIG.events, CONFIG.camera.height, CONFIG.camera.width, jax.random.key(0)),
         episode_return=jnp.zeros(count),
         key=jax.random.split(jax.random.key(0), count),
     )

@@ -24,7 +24,7 @@ from edqn_jax.extras import MissingPackageError, require_extra
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.waves import cosine_basis
 from edqn_jax.runs.directory import to_plain_json
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement.flags import parse_config

@@ -24,7 +24,7 @@ from edqn_jax.sim.physics.airframe import c_model, load_airframe, mixer_of
 from edqn_jax.sim.physics.controller import rotor_thrusts as thrusts_in_jax
 from edqn_jax.sim.physics.flight import fly_decision
 from edqn_jax.sim.scene.mjcf import load_scene
-from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors import event_laws, event_memory
 from edqn_jax.sim.task.action_sets import heading_to_goal, velocity_command
 from edqn_jax.sim.task.observation import own_state
 from tutorial_stack.control import thrusts
@@ -86,8 +86,8 @@ def test_the_events_are_those_of_the_papers_law() -> None:
     before, after = np.random.default_rng(1).integers(0, 256, (2, 24, 32, 3), dtype=np.uint8)
     law = dataclasses.replace(CONFIG.events, threshold=0.15, tolerance=0.1)
     luma = jnp.asarray(np.stack([before, after]) @ np.array(camera.LUMA_WEIGHTS) / 255.0)
-    memory = events.reset_memory(law, 24, 32, jax.random.key(0))
-    field, _ = events.generate_events(law, memory, luma, law.frame_times_s, jax.random.key(1))
+    memory = event_memory.reset_memory(law, 24, 32, jax.random.key(0))
+    field, _ = event_laws.generate_events(law, memory, luma, law.frame_times_s, jax.random.key(1))
     expected = np.asarray(field.polarity * np.log1p(field.count))
     assert (np.abs(event_image(law, before, after) - expected) > 1e-6).mean() < 0.005  # counts at a whole number
 

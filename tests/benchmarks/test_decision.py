@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
 
 import decision
+from tests.support.benchmarks.kept_cores import give_cores
 
 
 @pytest.mark.slow
 def test_it_keeps_to_one_core_and_says_what_it_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    kept_to: list[set[int]] = []
-    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: kept_to.append(cores), raising=False)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3}, raising=False)
+    kept_to = give_cores(monkeypatch, 2, 3)
     monkeypatch.setattr(decision, "decision_latency_ms", lambda *_: {"median": 0.5, "p99": 0.75})
     file = tmp_path / "decision.json"
     assert decision.main(["--quick", "--json", str(file)]) == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,8 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
+from tests.support.benchmarks.kept_cores import give_cores
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def test_events_are_those_of_flights_one_by_one(policy: Policy) -> None:
 def test_it_says_what_each_sensor_costs(
     policy: Policy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: None, raising=False)
+    give_cores(monkeypatch, 0)
     monkeypatch.setattr(sensing, "load_policy", lambda name: policy)
     monkeypatch.setattr(sensing, "events_per_decision", lambda *_: 250.0)
     monkeypatch.setattr(sensing, "look_call", lambda config, *_: ("look", config.env.sensor))
@@ -99,7 +99,7 @@ def test_a_policy_without_events_is_refused(
     policy: Policy, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     blind = dataclasses.replace(policy.config, env=dataclasses.replace(policy.config.env, sensor="blind"))
-    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: None, raising=False)
+    give_cores(monkeypatch, 0)
     monkeypatch.setattr(sensing, "load_policy", lambda name: Policy(blind, policy.params))
     assert sensing.main([]) == 2
     said = capsys.readouterr().err

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 
@@ -37,6 +38,22 @@ def test_what_one_call_trains_another_flies(tmp_path: Path, monkeypatch, capsys)
     file.unlink()
     with pytest.raises(pytest.fail.Exception, match="trained again"):
         call(tmp_path, "--no-spl")
+
+
+def test_a_training_that_another_process_does_is_left_to_it(tmp_path: Path) -> None:
+    taken, free = tmp_path / "rows" / "a-b-1.json", tmp_path / "rows" / "a-b-2.json"
+    done: list[Path] = []
+    wanted = [
+        success.Wanted(file, lambda: {}, functools.partial(done.append, success.policies_of(file)))
+        for file in (taken, free)
+    ]
+    taken.parent.mkdir()
+    with success._claim(taken) as ours:
+        assert ours
+        success.train_all(wanted, 1e12)
+        assert done == [success.policies_of(free)]
+    success.train_all(wanted[:1], 1e12)
+    assert done[1:] == [success.policies_of(taken)]
 
 
 @pytest.mark.slow

@@ -121,7 +121,7 @@ def test_a_row_that_another_process_measures_is_left_to_it(tmp_path: Path) -> No
 def test_looks_that_one_program_can_fly_are_flown_together_and_told_apart_again(monkeypatch) -> None:
     courses = []
 
-    def fly(config: Config, course: object, params: object) -> object:
+    def fly(config: Config, course: object, params: object, **_: object) -> object:
         courses.append(course)
         count = course.missions.scene.shape[0]  # type: ignore[attr-defined]
         arrived = np.arange(count) % 3 + params  # type: ignore[operator]

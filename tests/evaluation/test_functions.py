@@ -15,6 +15,7 @@ import pytest
 import edqn_jax
 from edqn_jax.cli import main
 from edqn_jax.config import Config
+from edqn_jax.config.loading import with_conditions
 from edqn_jax.config.registry import ACTION_SETS
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.trajectories import flight_trajectory, trajectory_columns
@@ -23,7 +24,7 @@ from edqn_jax.interop import functional
 from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import Policy
-from edqn_jax.policies.functions import FunctionActor, FunctionPolicy, load_function
+from edqn_jax.policies.functions import FunctionActor, FunctionPolicy, actor_of, load_function
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task.action_sets import VELOCITY, ActionSet
 from edqn_jax.sim.task.env import Observation
@@ -327,3 +328,16 @@ def test_a_flight_of_a_function_is_recorded_with_what_it_saw(tmp_path: Path) -> 
     with np.load(tmp_path / "fast.npz") as held:
         assert np.all(held["flight_action"][1:] == [0.0, 0.0, 1.0]) and not held["flight_action"][0].any()
         np.testing.assert_array_equal(held["flight_move"], held["flight_action"])
+
+
+@pytest.mark.parametrize("exposure", [{"real": True}, {"longest_s": 0.05}, {"latency_s": 0.05}])
+def test_an_encoder_flies_with_as_many_attitudes_as_it_was_trained_with(exposure: dict[str, Any]) -> None:
+    sees = {"env": {"sensor": "frame-pair"}, "camera": {"mount": "body"}, "light": {"least_lux": 1, "most_lux": 1}}
+    learnt = {"real": "real" not in exposure, "longest_s": 0.02}
+    trained = edqn_jax.make_config("medium", exposure=learnt, **sees)
+    policy = Policy(trained, params=None)  # type: ignore[arg-type]
+    flown = with_conditions(trained, {"exposure": exposure}, "test")
+    with pytest.raises(ConfigError, match="values of the own motion and would be given .*'frame-pair' looks, .* body;"):
+        actor_of(policy, flown)
+    assert isinstance(actor_of(policy, with_conditions(trained, {"air": {"gusts_m_s": 1.0}}, "test")), AgentActor)
+    assert isinstance(actor_of(FunctionPolicy(lambda observation, memory, key: (0, memory)), flown), FunctionActor)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
 
 import deployed
+from tests.support.benchmarks.kept_cores import give_cores
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx and what it imports
 
@@ -16,9 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx and what it import
 def test_it_keeps_to_one_core_and_says_what_it_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    kept_to: list[set[int]] = []
-    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: kept_to.append(cores), raising=False)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3}, raising=False)
+    kept_to = give_cores(monkeypatch, 2, 3)
     file = tmp_path / "deployed.json"
     assert deployed.main(["--quick", "--camera", "64", "48", "--json", str(file)]) == 0
     assert kept_to == [{2}]
@@ -30,7 +28,7 @@ def test_it_keeps_to_one_core_and_says_what_it_measured(
 
 
 def test_bad_input_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: None, raising=False)
+    give_cores(monkeypatch, 0)
     assert deployed.main(["nowhere"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert deployed.main(["--camera", "0", "4"]) == 2

@@ -13,7 +13,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require_extra
 from edqn_jax.interop.recordings.event_files import read_events
 from edqn_jax.interop.recordings.prophesee_words import EVT3
-from edqn_jax.sim.sensors.events import STREAM_DTYPE
+from edqn_jax.sim.sensors.event_field import STREAM_DTYPE
 from tests.oracles import event_words
 from tests.oracles.aedat4_bytes import aedat4
 from tests.support.interop.recordings import HEIGHT, WIDTH, some_events

@@ -17,6 +17,7 @@ pytest.importorskip("pymavlink")
 
 from edqn_jax.errors import ConfigError  # noqa: E402
 from edqn_jax.fly.link import VELOCITY_AND_YAW, Link, connect  # noqa: E402
+from tests.support.interop.ports import free_port  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # pymavlink leaves sockets to the collector
 
@@ -46,9 +47,7 @@ Ends = Callable[..., End]
 
 @pytest.fixture
 def port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    return free_port()
 
 
 @pytest.fixture

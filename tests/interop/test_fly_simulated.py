@@ -36,6 +36,7 @@ from edqn_jax.fly.simulated.several import fly_at_once  # noqa: E402
 from edqn_jax.fly.streams import EVENT, DvStream  # noqa: E402
 from edqn_jax.interop.deployment.onnx_export import export_policy  # noqa: E402
 from edqn_jax.runs.policies import load_policy  # noqa: E402
+from tests.support.interop.ports import free_port  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx, evlib, rotorpy and what they import
 
@@ -202,12 +203,6 @@ class Bench:
 def start(module: str, *words: str) -> subprocess.Popen:
     command = [sys.executable, "-u", "-m", module, *words]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture

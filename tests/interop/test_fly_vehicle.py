@@ -20,6 +20,7 @@ from edqn_jax.fly.simulated.lockstep import SimulatedClock  # noqa: E402
 from edqn_jax.fly.streams import EVENT, Events  # noqa: E402
 from edqn_jax.interop.deployment.runner import Command  # noqa: E402
 from edqn_jax.interop.outer.rotorpy_body import STEP_S  # noqa: E402
+from tests.support.interop.ports import free_port  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # pymavlink, rotorpy and what they import
 
@@ -30,9 +31,7 @@ class Together:
     """A vehicle and a link to it, in steps of the vehicle's clock."""
 
     def __init__(self, *words: str) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.port = probe.getsockname()[1]
+        self.port = free_port()
         self.link = Link(f"udpin:127.0.0.1:{self.port}", START)
         place = [str(each) for each in START]
         more = ["--mavlink", f"udpout:127.0.0.1:{self.port}", "--start", *place, *words]
@@ -125,9 +124,7 @@ def test_an_unarmed_vehicle_stays_where_it_is_and_arms_for_whom_it_is_told_to(ma
 
 
 def test_a_ground_station_on_another_endpoint_is_forwarded(make: Callable[..., Together]) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     from edqn_jax.fly.link import connect
 
     both = make()

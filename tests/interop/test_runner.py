@@ -18,7 +18,7 @@ from edqn_jax.extras import MissingPackageError
 from edqn_jax.interop.deployment import onnx_export, runner
 from edqn_jax.interop.deployment.onnx_export import RUNNER, about_policy, export_policy
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.sensors.events import STREAM_DTYPE
+from edqn_jax.sim.sensors.event_field import STREAM_DTYPE
 from tests.support.interop.flights import Decided, flown, untrained
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx and what it imports

@@ -10,7 +10,8 @@ from jax import Array
 from numpy.typing import NDArray
 
 from edqn_jax.config import EventsConfig
-from edqn_jax.sim.sensors.events import MICROSECOND, EventField, event_image, event_times
+from edqn_jax.sim.sensors.event_field import MICROSECOND, EventField, event_image
+from edqn_jax.sim.sensors.events import event_times
 
 
 def signed_count(field: EventField) -> Array:

@@ -20,6 +20,7 @@ from edqn_jax.report.sights import (
     decision_rows,
     downsample_picture,
     own_motions,
+    start_poses,
     trajectory_poses,
 )
 from edqn_jax.sim.actions import ACTIONS
@@ -27,7 +28,7 @@ from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.scene import stack_scenes
-from edqn_jax.sim.sensors import events, sensor
+from edqn_jax.sim.sensors import event_field, sensor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import with_lean
@@ -42,14 +43,13 @@ def sights_of(config: Config) -> FlightRenderer:
         return FlightRenderer(config, world_with_a_box(), threads)
 
 
-@pytest.fixture(scope="module")
-def flight() -> tuple[dict[str, np.ndarray], env.Step]:
-    """A flight as the columns of a trajectory, and as the steps that the drone took."""
+def fly(config: Config) -> tuple[dict[str, np.ndarray], env.Step]:
+    """Returns a flight as the columns of a trajectory, and as the steps that the drone took."""
     pool = stack_scenes([world_with_a_box()])
-    world = env.EnvParams(load_airframe(SMALL.drone), pool, own_missions(pool))
-    state, _ = env.reset(SMALL, world, jax.random.key(3), jnp.asarray(0))
+    world = env.EnvParams(load_airframe(config.drone), pool, own_missions(pool))
+    state, _ = env.reset(config, world, jax.random.key(3), jnp.asarray(0))
     actions = jnp.array([np.flatnonzero((ACTIONS == move).all(axis=1))[0] for move in MOVES])
-    _, steps = jax.jit(lambda state: jax.lax.scan(partial(env.step, SMALL, world), state, actions))(state)
+    _, steps = jax.jit(lambda state: jax.lax.scan(partial(env.step, config, world), state, actions))(state)
     columns = (
         np.concatenate([steps.flight.position, steps.flight.quaternion, steps.flight.velocity], -1).reshape(-1, 10).T
     )
@@ -61,6 +61,11 @@ def flight() -> tuple[dict[str, np.ndarray], env.Step]:
 
 
 @pytest.fixture(scope="module")
+def flight() -> tuple[dict[str, np.ndarray], env.Step]:
+    return fly(SMALL)
+
+
+@pytest.fixture(scope="module")
 def sights() -> FlightRenderer:
     return sights_of(SMALL)
 
@@ -69,11 +74,32 @@ def sights() -> FlightRenderer:
 def test_the_events_are_those_that_the_drone_got(sights, flight):
     flown, steps = flight
     shown = sights.shown(fresh_policy(SMALL), flown)
-    seen = np.asarray(jax.vmap(events.event_image)(steps.observation.sensed))
+    seen = np.asarray(jax.vmap(event_field.event_image)(steps.observation.sensed))
     assert np.abs(seen).sum() > 500
     np.testing.assert_array_equal(shown.image, seen)
     assert shown.target.shape == shown.reconstruction.shape == (len(MOVES), HEIGHT, WIDTH)
     assert shown.target.min() > -1e-5
+
+
+@pytest.mark.slow
+def test_what_slow_photoreceptors_show_of_the_first_decision_follows_the_start():
+    events = dataclasses.replace(SMALL.events, bandwidth_hz=8.0, threshold=0.003, tolerance=0.003)
+    slow = dataclasses.replace(SMALL, events=events)
+    flown, steps = fly(slow)
+    shown = sights_of(slow).shown(fresh_policy(slow), flown)
+    seen = np.asarray(jax.vmap(event_field.event_image)(steps.observation.sensed))
+    assert np.abs(seen[0]).sum() > 100
+    np.testing.assert_array_equal(shown.image, seen)
+
+
+def test_a_flight_starts_at_rest_where_it_started(flight):
+    flown, _ = flight
+    position, quaternion, time = start_poses(SMALL, flown)
+    world = world_with_a_box()
+    assert position.shape == (1, 2, 3) and quaternion.shape == (1, 2, 4)
+    np.testing.assert_allclose(position[0], np.broadcast_to(world.start, (2, 3)), atol=1e-5)
+    np.testing.assert_allclose(quaternion[0], np.broadcast_to([1.0, 0, 0, 0], (2, 4)), atol=1e-4)
+    np.testing.assert_allclose(time[0], SMALL.events.frame_times_s, atol=1e-6)
 
 
 def test_own_motions_are_those_that_the_drone_knew(flight):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import EventsConfig
-from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.sensors import event_field, event_laws, event_memory, events
 
 HEIGHT, WIDTH = 4, 5
 
@@ -32,12 +32,14 @@ ESIM = EventsConfig(law="esim", contrast_on=0.12, contrast_off=0.09, refractory_
 
 @partial(jax.jit, static_argnames=("config", "times", "continuous", "gap_s"))
 def run(config, memory, frames, times=TIMES, continuous=False, gap_s=None):
-    return ev.generate_events(config, memory, frames, times, jax.random.key(KEY), continuous=continuous, gap_s=gap_s)
+    return event_laws.generate_events(
+        config, memory, frames, times, jax.random.key(KEY), continuous=continuous, gap_s=gap_s
+    )
 
 
 @partial(jax.jit, static_argnames=("config", "height", "width"))
 def memory_of(config, seed, height=HEIGHT, width=WIDTH):
-    return ev.reset_memory(config, height, width, jax.random.key(seed))
+    return event_memory.reset_memory(config, height, width, jax.random.key(seed))
 
 
 def random_frames(seed: int, count: int = len(TIMES)) -> np.ndarray:
@@ -48,10 +50,10 @@ def random_frames(seed: int, count: int = len(TIMES)) -> np.ndarray:
 
 
 def levels(config: EventsConfig, frames: np.ndarray) -> np.ndarray:
-    return np.asarray(ev.log_brightness(config, jnp.asarray(frames)))
+    return np.asarray(events.log_brightness(config, jnp.asarray(frames)))
 
 
-def host(field: ev.EventField) -> ev.EventField:
+def host(field: event_field.EventField) -> event_field.EventField:
     return jax.tree.map(np.asarray, field)
 
 

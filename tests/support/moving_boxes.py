@@ -7,7 +7,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import CameraConfig, EventsConfig
-from edqn_jax.sim.sensors.events import EventField, generate_events, reset_memory
+from edqn_jax.sim.sensors.event_field import EventField
+from edqn_jax.sim.sensors.event_laws import generate_events
+from edqn_jax.sim.sensors.event_memory import reset_memory
 
 BOXES = 5
 

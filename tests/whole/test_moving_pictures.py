@@ -20,7 +20,7 @@ from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.motion import Motion, Throw
 from edqn_jax.sim.scene.scene import PARKED, Planes, Scene, Spheres, UprightBoxes, build_scene, stack_scenes
-from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from tests.support.box_flight import SMALL, Drawn, a_flight, recorded
@@ -100,7 +100,7 @@ def test_the_pictures_of_a_flight_are_those_that_the_drone_saw():
     flown["action"] = np.repeat(actions, SMALL.drone.physics_steps)
     with ThreadPoolExecutor(2) as threads:
         sights = FlightRenderer(SMALL, scene, threads)
-    seen = np.asarray(jax.vmap(events.event_image)(steps.observation.sensed))
+    seen = np.asarray(jax.vmap(event_field.event_image)(steps.observation.sensed))
     assert np.abs(seen).sum() > 100  # of the obstacle's own motion
     np.testing.assert_array_equal(sights.shown(fresh_policy(SMALL), flown).image, seen)
     rows = decision_rows(SMALL, flown)[:, -1]

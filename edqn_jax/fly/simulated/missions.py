@@ -9,12 +9,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from edqn_jax.evaluation.judge import MujocoWorld, clearance, load_judge, replay
 from edqn_jax.fly.records import RECORDS, read_records
 from edqn_jax.fly.simulated.camera import EventCamera, EventServer
 from edqn_jax.fly.simulated.lockstep import Keeper
+from edqn_jax.fly.simulated.ports import hold_udp_port
 from edqn_jax.fly.simulated.vehicle import TRUTH
 from edqn_jax.interop.outer import pictures
 from edqn_jax.interop.outer.event_cameras import CONTRAST
@@ -146,7 +146,7 @@ def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
         stack.callback(server.close)
         keeper = Keeper(setup.speed)
         stack.callback(keeper.close)
-        port, let_go = _held_port()
+        port, let_go = hold_udp_port()
         stack.callback(let_go)
         yaw = float(np.arctan2(goal[1] - start[1], goal[0] - start[0]))
         words = _vehicle_words(start, yaw, port, keeper.address, number, setup)
@@ -267,14 +267,6 @@ def _wait(process: subprocess.Popen) -> None:
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
-
-
-def _held_port() -> tuple[int, Callable[[], None]]:
-    """Returns a free UDP port, and what lets it go: no other mission gets it before the autopilot has taken it."""
-    held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    held.bind(("127.0.0.1", 0))
-    held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as pymavlink's, which binds beside it
-    return held.getsockname()[1], held.close
 
 
 def environment_of(world: str, config: Config, missions: int, seed: int) -> Environment:

@@ -25,8 +25,8 @@ from edqn_jax.learn.policy import Policy
 from edqn_jax.learn.qnetwork import q_values
 from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import ACTIONS, move_name
-from edqn_jax.sim.sensors import contrast, events
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors import contrast, event_laws, event_memory, event_noise, events
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.task.observation import (
     MAX_YAW_RATE,
     Observation,
@@ -171,7 +171,7 @@ def about_policy(config: Config) -> dict[str, Any]:
         "known_contrast": _known_contrast(config),
         "knows_lean": leans(config),
         "sensor_pixels": law.sensor_pixels,
-        "counts_net": not events.has_noise(config.events),
+        "counts_net": not event_noise.has_noise(config.events),
         "history": config.agent.history,
         "observation_size": observation_size(config),
         "decision_s": config.drone.physics_steps * config.drone.physics_dt_s,
@@ -223,7 +223,7 @@ def field_of(config: Config, counts: Array, motion: Array) -> EventField:
     Polarities are int32.
     """
     on, off = counts[..., 0, :, :], counts[..., 1, :, :]
-    if events.has_noise(config.events):
+    if event_noise.has_noise(config.events):
         count = jnp.concatenate([on, off], axis=-3)
         sign = jnp.concatenate([jnp.ones_like(on), -jnp.ones_like(off)], axis=-3)
     else:
@@ -243,7 +243,7 @@ def field_of(config: Config, counts: Array, motion: Array) -> EventField:
         t_step=step,
         window_s=float(edges[-1]),
         divides_window=_only_counts(config),
-        with_noise=events.has_noise(config.events),
+        with_noise=event_noise.has_noise(config.events),
         unit=_unit(config, motion),
     )
 
@@ -251,7 +251,7 @@ def field_of(config: Config, counts: Array, motion: Array) -> EventField:
 def _unit(config: Config, motion: Array) -> Array | None:
     """Returns what an event counts [...] with own motions [..., motion_size]; None where it is 1."""
     known = contrast.contrast_of(motion[..., -1]) if knows_contrast(config) else None
-    unit = events.unit_of(config.events, known)
+    unit = event_memory.unit_of(config.events, known)
     return None if unit is None else jnp.broadcast_to(unit, motion.shape[:-1])
 
 
@@ -268,7 +268,7 @@ def _sense(config: Config, counts: Array, motion: Array) -> EventField | Array:
 
 def _only_counts(config: Config) -> bool:
     """Returns whether the counts of a window say all that there is to its events."""
-    return events.divides_window(config.events, len(config.events.frame_times_s))
+    return event_laws.divides_window(config.events, len(config.events.frame_times_s))
 
 
 def _shapes(config: Config) -> list[jax.ShapeDtypeStruct]:
@@ -282,7 +282,7 @@ def _random_inputs(config: Config, rng: np.random.Generator) -> list[np.ndarray]
     """Returns inputs of every density of events, from none on."""
     counts, own, motion, memory = (given.shape for given in _shapes(config))
     number = rng.poisson(3.0 * rng.random(), counts) * (rng.random(counts) < rng.random())
-    if not events.has_noise(config.events):  # of a pixel's events between two frames all have one polarity
+    if not event_noise.has_noise(config.events):  # of a pixel's events between two frames all have one polarity
         number[:, :, 0][rng.random(number[:, :, 0].shape) < 0.5] = 0
         number[:, :, 1][number[:, :, 0] > 0] = 0
     numbers = (rng.uniform(-1.0, 1.0, own), rng.uniform(-1.0, 1.0, motion), rng.normal(0.0, 0.5, memory))

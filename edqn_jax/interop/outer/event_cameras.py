@@ -11,7 +11,7 @@ from edqn_jax.config import EventsConfig
 from edqn_jax.extras import MissingPackageError, require_extra
 from edqn_jax.interop.outer.pictures import See
 from edqn_jax.interop.outer.poses import Track, camera_rotation
-from edqn_jax.sim.sensors.events import STREAM_DTYPE
+from edqn_jax.sim.sensors.event_field import STREAM_DTYPE
 
 WIDE, HIGH = 346, 260
 """Pixels of the cameras of `esim` and `v2e`: a DAVIS346."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.sensors.events import STREAM_DTYPE
+from edqn_jax.sim.sensors.event_field import STREAM_DTYPE
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
 

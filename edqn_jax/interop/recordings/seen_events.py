@@ -20,7 +20,7 @@ from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import check_has_params
-from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task.observation import Observation, own_size
 
 
@@ -155,6 +155,6 @@ def _encode_and_decode(config: Config, params: PolicyParams, counts: Array, moti
         channels = vae.decode(config.encoder, config.camera, params.encoder, code)
         nearness = embedding.needs_nearness(config)
         decoded = channels[-1] if nearness else jnp.sum(jnp.expm1(channels), axis=-3)
-        return events.event_image(field), decoded
+        return event_field.event_image(field), decoded
 
     return jax.jit(lambda c, m: jax.lax.map(one, (c, m)))(counts, motion)

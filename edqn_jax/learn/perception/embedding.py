@@ -13,7 +13,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form, Params
 from edqn_jax.learn.perception.levelling import level_events
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.observation import Observation, knows_contrast, lean_motion_size, lean_of, motion_size
 

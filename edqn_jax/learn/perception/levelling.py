@@ -14,7 +14,7 @@ from jax import Array
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.sim.camera.raycast import image_plane, pitch_of
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 
 LEAST_AHEAD = 0.1
 """Directions of which less than this points ahead of the body's camera are outside of its picture."""

@@ -18,7 +18,7 @@ from jax import Array
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.perception.code import CodeHead
 from edqn_jax.learn.perception.layers import Dense, add_shared
-from edqn_jax.sim.sensors.events import EventField, in_units
+from edqn_jax.sim.sensors.event_field import EventField, in_units
 
 
 def log_counts(field: EventField) -> list[Array]:

@@ -25,7 +25,7 @@ from jax import Array
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.perception.code import EVENT_CHANNELS, CodeHead
 from edqn_jax.learn.perception.waves import channel_polarities, paired_relu_init, wave_table
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sine import sin_pi
 
 POSITION_OCTAVES = 4
@@ -47,7 +47,7 @@ def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
     The geometric series of n phasors a step apart is Dirichlet's kernel, `sin(n x) / sin(x)`, times the
     middle phasor. Half turns are subtracted from x first: the kernel is then stable where sin(x) vanishes.
 
-    Sums are in the field's units, see `events.in_units`.
+    Sums are in the field's units, see `event_field.in_units`.
     """
     sums = _sums_of_events(frequencies, field)
     if field.unit is None:

@@ -23,7 +23,7 @@ from edqn_jax.learn.perception.code import EVENT_CHANNELS, Form, Params, kl_dive
 from edqn_jax.learn.perception.layers import Dense, init_params, matmul
 from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
 from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosine_basis, paired_relu_init, wave_images
-from edqn_jax.sim.sensors.events import EventField, in_units
+from edqn_jax.sim.sensors.event_field import EventField, in_units
 from edqn_jax.sim.task.observation import MOTION_SIZE
 
 

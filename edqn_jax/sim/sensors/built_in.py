@@ -11,8 +11,9 @@ from edqn_jax.sim.actions import DIRECTIONS
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
-from edqn_jax.sim.sensors import events, exposure, light
-from edqn_jax.sim.sensors.events import EventField, EventMemory
+from edqn_jax.sim.sensors import event_field, event_laws, event_memory, exposure, light
+from edqn_jax.sim.sensors.event_field import EventField
+from edqn_jax.sim.sensors.event_memory import EventMemory
 from edqn_jax.sim.sensors.exposure import FrameMemory
 from edqn_jax.sim.sensors.sensor import (
     EVENT_FIELD,
@@ -50,7 +51,7 @@ def _show_events(
     assert isinstance(memory, EventMemory)
     options, times = config.events, config.events.frame_times_s
     gap_s = max(config.drone.physics_steps * config.drone.physics_dt_s + times[0], 0.0)
-    return events.generate_events(options, memory, frames, times, key, continuous=options.stream, gap_s=gap_s)
+    return event_laws.generate_events(options, memory, frames, times, key, continuous=options.stream, gap_s=gap_s)
 
 
 def _show_event_image(
@@ -59,7 +60,7 @@ def _show_event_image(
     """Returns log(1 + count) of each pixel's ON minus OFF events, with their sign."""
     field, memory = _show_events(config, scene, poses, memory, key)
     assert isinstance(field, EventField)
-    return signed_log(events.image_in_units(field)).ravel(), memory
+    return signed_log(event_field.image_in_units(field)).ravel(), memory
 
 
 def _event_memory(config: Config, key: Array) -> SensorMemory:
@@ -67,7 +68,7 @@ def _event_memory(config: Config, key: Array) -> SensorMemory:
     if light.is_on(config.light):
         key, drawing = jax.random.split(key)
         lux = light.sample_illuminance(config.light, drawing)
-    return events.reset_memory(config.events, config.camera.height, config.camera.width, key, lux)
+    return event_memory.reset_memory(config.events, config.camera.height, config.camera.width, key, lux)
 
 
 def _show_frame(

@@ -1,7 +1,7 @@
 """The contrast of an episode's event sensor: log-brightness change per event, drawn anew and known to the networks.
 
 A user knows the contrast of his camera, so a policy may, too. The thresholds of the law scale with it, and what the
-encoder reads are log-brightness changes in units of `REFERENCE`, whatever the contrast; see `events.in_units`.
+encoder reads are log-brightness changes in units of `REFERENCE`, whatever the contrast; see `event_field.in_units`.
 """
 
 from __future__ import annotations

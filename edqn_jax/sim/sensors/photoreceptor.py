@@ -74,6 +74,6 @@ def filter_log_brightness(
         lag = lag * (1.0 - fade) - change * jnp.where(r > 0.0, fade / jnp.maximum(r, 1e-12), 1.0)
         return lag, lag
 
-    # As in `events`: a window of two or three frames needs no loop.
+    # As in `event_laws`: a window of two or three frames needs no loop.
     last, lags = jax.lax.scan(pair, lag, (jnp.diff(level, axis=0), turns), unroll=min(len(times) - 1, 2))
     return level + jnp.concatenate([lag[None], lags]), last

@@ -31,8 +31,9 @@ from edqn_jax.sim.camera.raycast import Rays
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.scene.shapes.kind import TINY
-from edqn_jax.sim.sensors import events, exposure, frame_clock
-from edqn_jax.sim.sensors.events import EventField, EventMemory
+from edqn_jax.sim.sensors import event_field, event_laws, events, exposure, frame_clock
+from edqn_jax.sim.sensors.event_field import EventField
+from edqn_jax.sim.sensors.event_memory import EventMemory
 from edqn_jax.sim.sensors.exposure import FrameMemory
 from edqn_jax.user_code import check_functions, describe_object
 
@@ -87,9 +88,10 @@ class Sensor:
     draws_frames: bool = False
     """Whether `show` draws a picture at each of these times."""
     makes_events: bool = False
-    """Whether its memory is an `EventMemory`, whose contrast the networks know where it is drawn."""
+    """Whether its memory has the episode's `contrast` and `lux`, which the networks can be told, as `EventMemory`."""
     exposes: bool = False
-    """Whether its pictures are taken as `exposure` has it, from the poses up to a frame's time."""
+    """Whether its pictures are taken as `exposure` has it, from the poses up to a frame's time. With `exposure.real`
+    its memory has the episode's `lux`, which the networks can be told, as `FrameMemory`."""
     at_rest: Callable[[Config, Array], Any] = lambda config, key: None
     """Memory before the first decision, from a key; None where nothing is carried from one decision to the next."""
     image: Image | None = None
@@ -141,7 +143,7 @@ class Sensor:
         seen = self.encoder_input(config, sensed)
         assert seen is not None and self.image is not None
         if isinstance(seen, EventField):
-            return events.event_image(seen)
+            return event_field.event_image(seen)
         return seen[..., self.image.picture, :, :]
 
     def picture_of_target(self, config: Config, channels: Array) -> Array:
@@ -163,7 +165,7 @@ class Sensor:
         """
         shapes = self.shapes(config)
         parts = self._parts(config, sensed, lambda shape: True)
-        arrays = [signed_log(events.image_in_units(x)) if isinstance(x, EventField) else x for x in parts]
+        arrays = [signed_log(event_field.image_in_units(x)) if isinstance(x, EventField) else x for x in parts]
         if len(arrays) == 1:
             return arrays[0]
         axes = [2 if shape == EVENT_FIELD else len(shape) for shape in shapes]
@@ -208,7 +210,7 @@ class Sensor:
 
         def random(shape: Any) -> EventField | Array:
             if shape == EVENT_FIELD:
-                return events.random_field(config.events, *size, rng)
+                return event_laws.random_field(config.events, *size, rng)
             return jnp.asarray(rng.random(shape, np.float32))
 
         self.shapes(config)

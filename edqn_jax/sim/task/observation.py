@@ -12,13 +12,12 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config, EnvConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.scene import Scene, has_motion
 from edqn_jax.sim.sensors import contrast, light, sensor
-from edqn_jax.sim.sensors.events import EventMemory
-from edqn_jax.sim.sensors.exposure import FrameMemory
 from edqn_jax.sim.sensors.sensor import Sensed, SensorMemory, attitudes_seen, count_attitudes, frame_steps, sensor_of
 
 OWN_SIZE = 10
@@ -119,14 +118,31 @@ def lean_of(config: Config, motion: Array) -> Array:
 
 
 def with_told(config: Config, memory: SensorMemory, values: Array) -> Array:
-    """Returns own values [N] and after them those of the episode's light and contrast that the networks know."""
+    """Returns own values [N] and after them those of the episode's light and contrast that the networks know.
+
+    Raises:
+        ConfigError: if the sensor's memory has not what it should tell.
+    """
     if knows_light(config):
-        assert isinstance(memory, EventMemory | FrameMemory) and memory.lux is not None
-        values = jnp.concatenate([values, light.value_of(memory.lux)[None]])
+        values = jnp.concatenate([values, light.value_of(_held(config, memory, "lux"))[None]])
     if knows_contrast(config):
-        assert isinstance(memory, EventMemory) and memory.contrast is not None
-        values = jnp.concatenate([values, contrast.value_of(memory.contrast)[None]])
+        values = jnp.concatenate([values, contrast.value_of(_held(config, memory, "contrast"))[None]])
     return values
+
+
+def _held(config: Config, memory: SensorMemory, name: str) -> Array:
+    """Returns what the sensor's memory has of its episode under this name [].
+
+    Raises:
+        ConfigError: if it has nothing.
+    """
+    value = getattr(memory, name, None)
+    if value is None:
+        raise ConfigError(
+            f"the memory of the sensor '{config.env.sensor}' must have the episode's `{name}`, which the networks are "
+            "told; `at_rest` returns the first one"
+        )
+    return value
 
 
 def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tuple[Observation, SensorMemory]:

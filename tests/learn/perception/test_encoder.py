@@ -14,7 +14,7 @@ import pytest
 from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn.perception import pooled_encoder, vae
 from edqn_jax.learn.perception.code import Form, kl_divergence
-from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task.observation import MOTION_SIZE
 from tests.oracles import event_fields, pooled_encoder_plain
 from tests.support.moving_boxes import fields
@@ -46,7 +46,7 @@ def loss_of(config, params, sensed, key):
     return vae.vae_loss(config, params, sensed, STILL, wanted, noise)
 
 
-def ragged_field(seed: int, frame_pairs: int = 3) -> ev.EventField:
+def ragged_field(seed: int, frame_pairs: int = 3) -> event_field.EventField:
     """Random counts, polarities and times: more varied than any law would make them."""
     rng = np.random.default_rng(seed)
     shape = (frame_pairs, SMALL.height, SMALL.width)
@@ -57,10 +57,10 @@ def ragged_field(seed: int, frame_pairs: int = 3) -> ev.EventField:
     step[0, 0, :4] = 0.0  # all events at one instant: the geometric series degenerates
     step[0, 1, 0], count[0, 1, 0] = 0.02, 2  # half a turn of k = 1, a whole turn of k = 2
     polarity = np.where(count > 0, rng.choice([-1, 1], shape), 0).astype(np.int8)
-    return jax.tree.map(jnp.asarray, ev.EventField(count, polarity, first, step, 0.04))  # type: ignore
+    return jax.tree.map(jnp.asarray, event_field.EventField(count, polarity, first, step, 0.04))  # type: ignore
 
 
-def event_list(field: ev.EventField) -> tuple[jax.Array, ...]:
+def event_list(field: event_field.EventField) -> tuple[jax.Array, ...]:
     """Columns, rows, normalised times and polarities of all events, one by one, two empty places appended."""
     field, found = jax.tree.map(np.asarray, field), []
     for row, y, x in np.argwhere(np.asarray(field.count) > 0):
@@ -71,7 +71,7 @@ def event_list(field: ev.EventField) -> tuple[jax.Array, ...]:
     return jnp.asarray(x), jnp.asarray(y), jnp.asarray(tau, jnp.float32), jnp.asarray(p)
 
 
-def even_field() -> ev.EventField:
+def even_field() -> event_field.EventField:
     """As the default law makes them of one pair of frames: counts 0 to 5, either polarity."""
     rng = np.random.default_rng(4)
     counts = rng.integers(-5, 6, (SMALL.height, SMALL.width)).astype(np.int8)

@@ -11,11 +11,12 @@ import pytest
 
 from edqn_jax import ConfigError, make_config
 from edqn_jax.config import CameraConfig
+from edqn_jax.fly.frames import quaternion_of_angles
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.perception.levelling import level_events, level_places
 from edqn_jax.sim.camera.raycast import camera_rays, pitch_of
 from edqn_jax.sim.physics import drone
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.sensors.sensor import label_image, mount_rotation, nearness_image
 from edqn_jax.sim.task.observation import Observation, lean_of, motion_size, own_size
 from tests.support.drawn_scenes import every_kind, rotation_of
@@ -24,23 +25,12 @@ LEVEL, BODY = CameraConfig(), CameraConfig(mount="body")
 LEANS = [(0.0, 0.0), (0.3, 0.0), (0.0, -0.4), (-0.25, 0.5), (1.2, 0.9)]
 
 
-def quaternion_of(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    halves = np.array([roll, pitch, yaw]) / 2
-    (cr, cp, cy), (sr, sp, sy) = np.cos(halves), np.sin(halves)
-    return np.array(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
-
-
 @pytest.mark.parametrize(("roll", "pitch"), LEANS)
 def test_a_place_in_the_bodys_picture_looks_where_the_level_pixel_looks(roll: float, pitch: float) -> None:
     """The rays of both cameras, which know nothing of places, point the same way."""
-    rotation = mount_rotation(make_config(camera={"mount": "body"}), jnp.asarray(quaternion_of(roll, pitch, 0.7)))
+    rotation = mount_rotation(
+        make_config(camera={"mount": "body"}), jnp.asarray(quaternion_of_angles(roll, pitch, 0.7))
+    )
     level, body = camera_rays(LEVEL, rotation), camera_rays(BODY, rotation)
     row, column, seen = (np.asarray(x) for x in level_places(LEVEL, jnp.array([roll, pitch])))
     size = pitch_of(LEVEL)
@@ -60,11 +50,11 @@ def test_a_place_in_the_bodys_picture_looks_where_the_level_pixel_looks(roll: fl
 def test_roll_and_pitch_are_those_of_the_attitude() -> None:
     """What the own motion tells is what turned the test's rays."""
     for roll, pitch in LEANS:
-        found = drone.roll_and_pitch_of(jnp.asarray(quaternion_of(roll, pitch, -1.1)))
+        found = drone.roll_and_pitch_of(jnp.asarray(quaternion_of_angles(roll, pitch, -1.1)))
         np.testing.assert_allclose(found, [roll, pitch], atol=1e-5)
     np.testing.assert_allclose(
         rotation_of(0.3, -0.2, 0.5),
-        mount_rotation(make_config(camera={"mount": "body"}), jnp.asarray(quaternion_of(0.3, -0.2, 0.5))),
+        mount_rotation(make_config(camera={"mount": "body"}), jnp.asarray(quaternion_of_angles(0.3, -0.2, 0.5))),
         atol=1e-6,
     )
 
@@ -142,10 +132,10 @@ def test_only_events_of_a_camera_on_the_body_are_levelled() -> None:
 def test_the_label_of_levelled_events_is_that_of_a_level_camera() -> None:
     """At the heading to which roll and pitch are relative; without levelling it is the body's own view."""
     scene = every_kind(np.random.default_rng(4))
-    position, attitude = jnp.array([5.0, 5.0, 3.0]), jnp.asarray(quaternion_of(0.3, -0.25, 0.6), jnp.float32)
+    position, attitude = jnp.array([5.0, 5.0, 3.0]), jnp.asarray(quaternion_of_angles(0.3, -0.25, 0.6), jnp.float32)
     level, body = make_config("medium"), make_config("medium", camera={"mount": "body"})
     levelled = make_config("medium", camera={"mount": "body"}, encoder={"levelled": True})
-    flat = jnp.asarray(quaternion_of(0.0, 0.0, 0.6), jnp.float32)
+    flat = jnp.asarray(quaternion_of_angles(0.0, 0.0, 0.6), jnp.float32)
     label = label_image(levelled, scene, position, attitude)
     np.testing.assert_allclose(label, nearness_image(level, scene, position, flat), atol=1e-4)
     np.testing.assert_allclose(

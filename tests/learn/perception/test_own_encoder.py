@@ -19,7 +19,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import samples
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.sim.sensors.events import EventField, random_field
+from edqn_jax.sim.sensors.event_field import EventField
+from edqn_jax.sim.sensors.event_laws import random_field
 from edqn_jax.sim.task.observation import MOTION_SIZE, Observation
 from tests.support.registries import keep_as_they_are
 

@@ -16,7 +16,7 @@ from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form
 from edqn_jax.learn.perception.patch_encoder import log_counts, patch_places, to_patches
 from edqn_jax.native.products import in_precision
-from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task.observation import MOTION_SIZE
 from tests.oracles import event_fields, patch_encoder_plain
 
@@ -37,7 +37,7 @@ def shaken(params, key: int = 5):
     )
 
 
-def random_field(seed: int, pairs: int, *, noise: bool = False) -> ev.EventField:
+def random_field(seed: int, pairs: int, *, noise: bool = False) -> event_field.EventField:
     """Counts of 0 to 6, either polarity; with noise, rows of ON events and as many of OFF events."""
     rng = np.random.default_rng(seed)
     shape = (pairs * (2 if noise else 1), SMALL.height, SMALL.width)
@@ -45,11 +45,11 @@ def random_field(seed: int, pairs: int, *, noise: bool = False) -> ev.EventField
     sign = np.repeat([1, -1], pairs)[:, None, None] if noise else rng.choice([-1, 1], shape)
     polarity = np.where(count > 0, sign, 0).astype(np.int8)
     times = np.zeros(shape, np.float32)
-    field = ev.EventField(*map(jnp.asarray, (count, polarity, times, times)), window_s=0.04, with_noise=noise)  # pyright: ignore
+    field = event_field.EventField(*map(jnp.asarray, (count, polarity, times, times)), window_s=0.04, with_noise=noise)  # pyright: ignore
     return field
 
 
-def single_events(field: ev.EventField, pairs: int) -> list[patch_encoder_plain.Event]:
+def single_events(field: event_field.EventField, pairs: int) -> list[patch_encoder_plain.Event]:
     """All events one by one, in an arbitrary order; rows of OFF events follow those of ON events."""
     found = []
     for row, y, x in np.argwhere(np.asarray(field.count) > 0):
@@ -79,7 +79,7 @@ def test_both_polarities_of_a_pixel_are_counted_apart() -> None:
     blank[:, 0, 0] = 3, 2  # three ON events, two OFF events in the same frame pair
     polarity = np.array([1, -1], np.int8).reshape(2, 1, 1)
     times = jnp.zeros((2, 1, 1))
-    field = ev.EventField(jnp.asarray(blank), jnp.asarray(polarity), times, times, 0.04, with_noise=True)
+    field = event_field.EventField(jnp.asarray(blank), jnp.asarray(polarity), times, times, 0.04, with_noise=True)
     np.testing.assert_allclose([float(x[0, 0]) for x in log_counts(field)], np.log([4.0, 3.0]), rtol=1e-6)
 
 

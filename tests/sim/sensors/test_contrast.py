@@ -19,8 +19,7 @@ from edqn_jax.learn.perception import vae
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import stack_scenes
-from edqn_jax.sim.sensors import contrast
-from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.sensors import contrast, event_field, event_memory
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, rotate_own_state
@@ -109,9 +108,11 @@ def test_what_is_encoded_is_the_change_of_log_brightness_whatever_the_contrast()
     for value in (0.3, 0.1, 0.02):
         config = told(dataclasses.replace(unbound, threshold=unbound.tolerance), value)
         field = run(config, memory_of(config, 0), frames, (-0.04, 0.0))[0]
-        read = np.asarray(ev.in_units(field)) * contrast.REFERENCE
+        read = np.asarray(event_field.in_units(field)) * contrast.REFERENCE
         np.testing.assert_allclose(read, 1.2, atol=value)
-        np.testing.assert_allclose(ev.image_in_units(field), np.sum(read, axis=0) / contrast.REFERENCE, rtol=1e-5)
+        np.testing.assert_allclose(
+            event_field.image_in_units(field), np.sum(read, axis=0) / contrast.REFERENCE, rtol=1e-5
+        )
         target = vae.decoder_target(dataclasses.replace(DRAWN.encoder, target="sensed", target_blur=0), field)
         np.testing.assert_allclose(target[0], np.log1p(read[0] / contrast.REFERENCE), rtol=1e-5)
 
@@ -127,9 +128,9 @@ def test_what_is_stored_and_mirrored_keeps_its_units():
     wanted = vae.Target(jnp.zeros((2, 1, 3, 3)), jnp.zeros(2))
     kept = samples.samples_of(encoder, observation, wanted)
     read = samples.to_encoder_input(kept)
-    np.testing.assert_allclose(ev.in_units(read), field.count * np.array([4.0, 2.0])[:, None, None, None])
+    np.testing.assert_allclose(event_field.in_units(read), field.count * np.array([4.0, 2.0])[:, None, None, None])
     turned = samples.to_encoder_input(samples.mirror_samples(kept, task_of(DRAWN).mirror))
-    np.testing.assert_array_equal(ev.in_units(turned), ev.in_units(read)[..., ::-1])
+    np.testing.assert_array_equal(event_field.in_units(turned), event_field.in_units(read)[..., ::-1])
 
 
 # ---------------------------------------------------------------------------------------- conditions
@@ -169,7 +170,7 @@ def test_each_episode_has_a_share_of_the_faults():
     assert min(float(memory_of(half, seed).faults) for seed in range(40)) >= 0.5
 
 
-@pytest.mark.parametrize("share", [1.0, 0.3, ev.LEAST_SHARE])
+@pytest.mark.parametrize("share", [1.0, 0.3, event_memory.LEAST_SHARE])
 def test_a_sensor_with_a_share_of_its_faults_is_one_of_smaller_faults(share):
     whole = dataclasses.replace(FAULTY, faults_share=0.0)
     lesser = dataclasses.replace(

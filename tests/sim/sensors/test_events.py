@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import Config, EventsConfig
 from edqn_jax.config.loading import make_config
-from edqn_jax.sim.sensors import events as ev
-from edqn_jax.sim.sensors import poisson
+from edqn_jax.sim.sensors import event_field, event_laws, event_memory, event_noise, events, poisson
 from tests.oracles import event_fields, events_plain
 from tests.support.event_frames import (
     AIRSIM,
@@ -43,7 +42,7 @@ seeds = st.integers(0, 2**31 - 1)
 
 def assert_same_events(stream: np.ndarray, plain: list[events_plain.Event]) -> None:
     ours = np.sort(stream, order=["t", "y", "x"])
-    theirs = np.array([(round(t * 1e6), x, y, p) for t, x, y, p in plain], ev.STREAM_DTYPE)
+    theirs = np.array([(round(t * 1e6), x, y, p) for t, x, y, p in plain], event_field.STREAM_DTYPE)
     # Per pixel in order of time: float32 may move a stamp by a microsecond, so times cannot be matched first.
     ours, theirs = (s[np.lexsort((s["t"], s["x"], s["y"]))] for s in (ours, theirs))
     for name in ("x", "y", "p"):
@@ -60,7 +59,7 @@ def far_from_a_step(distance: np.ndarray, slack: float = 1e-4) -> bool:
 def test_log_brightness_of_black_is_finite_and_of_white_is_near_zero():
     config = EventsConfig()
     np.testing.assert_allclose(
-        ev.log_brightness(config, jnp.array([0.0, 1.0])), [np.log(1e-3), np.log(1.001)], rtol=1e-4, atol=1e-6
+        events.log_brightness(config, jnp.array([0.0, 1.0])), [np.log(1e-3), np.log(1.001)], rtol=1e-4, atol=1e-6
     )
 
 
@@ -80,7 +79,7 @@ def test_paper_law_equals_the_plain_loop(seed):
     assume(far_from_a_step(change[change > 0] / PAPER.tolerance))
     field, _ = run(PAPER, memory_of(PAPER, 0), jnp.asarray(frames))
     plain = events_plain.paper(level, np.array(TIMES), PAPER.threshold, PAPER.tolerance, PAPER.refractory_ns)
-    assert_same_events(ev.to_stream(host(field)), plain)
+    assert_same_events(event_field.to_stream(host(field)), plain)
     assert plain
 
 
@@ -99,7 +98,7 @@ def test_esim_law_equals_the_plain_loop(seed, law):
         config.contrast_off,
         config.refractory_ns,
     )
-    assert_same_events(ev.to_stream(host(field)), plain)
+    assert_same_events(event_field.to_stream(host(field)), plain)
     assert plain
 
 
@@ -107,7 +106,7 @@ def test_airsim_counts_equal_airsim_for_every_pair_of_grey_values():
     config = EventsConfig(law="airsim")
     grey = np.arange(256, dtype=np.float32) / 255.0
     frames = np.stack(np.meshgrid(grey, grey, indexing="ij"))
-    memory = ev.reset_memory(config, 256, 256, jax.random.key(0))
+    memory = event_memory.reset_memory(config, 256, 256, jax.random.key(0))
     field, _ = run(config, memory, jnp.asarray(frames), (0.0, 0.04))
     plain = np.array([[events_plain.airsim_count(a, b, 0.5) for b in range(256)] for a in range(256)])
     np.testing.assert_array_equal(field.count[0], plain[..., 0])
@@ -117,7 +116,7 @@ def test_airsim_counts_equal_airsim_for_every_pair_of_grey_values():
 @pytest.mark.parametrize(("change", "count"), [(0.51, 0), (0.99, 0), (1.01, 1), (1.51, 2), (2.6, 4)])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_airsim_emits_one_event_less_than_the_crossings(change, count, sign):
-    assert int(ev.airsim_count(jnp.float32(0.7), jnp.float32(0.7 + sign * change), 0.5, 1000)) == count
+    assert int(events.airsim_count(jnp.float32(0.7), jnp.float32(0.7 + sign * change), 0.5, 1000)) == count
 
 
 @pytest.mark.parametrize(("change", "count"), [(0.05, 0), (0.12, 0), (0.16, 1), (0.25, 2), (0.99, 3)])
@@ -132,8 +131,8 @@ def test_paper_counts_whole_tolerances_over_the_threshold_up_to_the_cap(change, 
 def test_a_change_must_exceed_the_threshold():
     threshold = jnp.float32(0.1)
     change = jnp.nextafter(threshold, jnp.array([0.0, 0.1, 1.0], jnp.float32))
-    np.testing.assert_array_equal(ev.event_polarity(change, threshold), [0, 0, 1])
-    np.testing.assert_array_equal(ev.event_polarity(-change, threshold), [0, 0, -1])
+    np.testing.assert_array_equal(events.event_polarity(change, threshold), [0, 0, 1])
+    np.testing.assert_array_equal(events.event_polarity(-change, threshold), [0, 0, -1])
 
 
 @pytest.mark.parametrize("pixels", [1, 9])
@@ -155,7 +154,7 @@ def test_the_dvs_flies_with_any_refractory_period(pixels, faults_share):
 
 @pytest.mark.parametrize(("refractory_ns", "limit"), [(1000.0, 40_000), (6e6, 6), (1e8, 0), (0.0, 2**31 - 1)])
 def test_the_cap_is_the_window_over_the_refractory_period(refractory_ns, limit):
-    assert ev.max_events(EventsConfig(refractory_ns=refractory_ns), 0.0 - -0.04) == limit
+    assert events.max_events(EventsConfig(refractory_ns=refractory_ns), 0.0 - -0.04) == limit
 
 
 @pytest.mark.parametrize("law", ["paper", "airsim", "binding esim"])
@@ -168,7 +167,7 @@ def test_a_binding_refractory_period_keeps_a_pixels_events_apart(law):
     field = host(run(config, memory, frames)[0])
     free = host(run(unbound, memory, frames)[0])
     assert field.count.sum() < free.count.sum()
-    stream = ev.to_stream(field)
+    stream = event_field.to_stream(field)
     for y in range(HEIGHT):
         for x in range(WIDTH):
             t = stream["t"][(stream["x"] == x) & (stream["y"] == y)]
@@ -202,11 +201,11 @@ def test_streaming_frame_by_frame_equals_one_long_window(law):
     config, frames = LAWS[law], long_flight(2, 41)
     times = tuple(0.02 * k for k in range(41))
     memory = memory_of(config, 4)
-    whole = ev.to_stream(host(run(config, memory, jnp.asarray(frames), times, True)[0]))
+    whole = event_field.to_stream(host(run(config, memory, jnp.asarray(frames), times, True)[0]))
     parts = []
     for k in range(40):
         field, memory = run(config, memory, jnp.asarray(frames[k : k + 2]), (0.0, 0.02), True)
-        parts.append(ev.to_stream(host(field), window_start_us=20_000 * k))
+        parts.append(event_field.to_stream(host(field), window_start_us=20_000 * k))
     streamed = np.concatenate(parts)
     order = ("t", "x", "y")
     whole, streamed = (s[np.lexsort([s[n] for n in order])] for s in (whole, streamed))
@@ -231,7 +230,7 @@ def test_esim_windows_are_half_open():
     frames = jnp.full((3, HEIGHT, WIDTH), 0.2).at[1:].set((0.2 + ESIM.log_epsilon) * rise - ESIM.log_epsilon)
     memory = memory_of(ESIM, 0).replace(residual=jnp.zeros((HEIGHT, WIDTH)))
     field = host(run(ESIM, memory, frames)[0])
-    stream = ev.to_stream(field)
+    stream = event_field.to_stream(field)
     assert np.all(field.count == [[[3]], [[0]]])
     assert stream["t"].max() == 19_999
     np.testing.assert_array_equal(event_fields.collect(stream, TIMES, HEIGHT, WIDTH).count, field.count)
@@ -243,7 +242,7 @@ def test_expansion_is_sorted_inside_the_window_and_lossless_both_ways(seed, law)
     config = LAWS[law]
     field = host(run(config, memory_of(config, seed), jnp.asarray(random_frames(seed)))[0])
     start_us = seed * 1000
-    stream = ev.to_stream(field, start_us)
+    stream = event_field.to_stream(field, start_us)
     assert np.all(np.diff(stream["t"]) >= 0)
     if len(stream):
         assert start_us <= stream["t"][0] and stream["t"][-1] < start_us + 40_000
@@ -254,7 +253,7 @@ def test_expansion_is_sorted_inside_the_window_and_lossless_both_ways(seed, law)
         true, found = (f.t_first + k * f.t_step.astype(np.float64) for f in (field, back))
         # Each stamp is the microsecond nearest to the truth, and the line is within half of one of the stamp.
         assert np.all(np.abs(true - found)[field.count > k] <= 1.0e-6 + 1e-9)
-    again = ev.to_stream(back, start_us)
+    again = event_field.to_stream(back, start_us)
     np.testing.assert_array_equal(np.sort(stream), np.sort(again))
 
 
@@ -264,7 +263,7 @@ def test_a_stream_of_evenly_spaced_events_survives_collection(data):
     start = data.draw(st.floats(0.0, 5000.0))
     step = data.draw(st.floats(1.0, 300.0))
     count = data.draw(st.integers(1, 40))
-    stream = np.zeros(count, ev.STREAM_DTYPE)
+    stream = np.zeros(count, event_field.STREAM_DTYPE)
     stamps = start + step * np.arange(count)
     # Halves are rounded to even, up and down, which only the very same line does.
     assume(np.all(np.abs(stamps % 1.0 - 0.5) > 1e-3))
@@ -272,11 +271,11 @@ def test_a_stream_of_evenly_spaced_events_survives_collection(data):
     stream["x"], stream["y"], stream["p"] = 2, 1, -1
     field = event_fields.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
     assert field.count.sum() == field.count[0, 1, 2] == count
-    np.testing.assert_array_equal(ev.to_stream(field), stream)
+    np.testing.assert_array_equal(event_field.to_stream(field), stream)
 
 
 def test_collect_refuses_a_stream_that_no_field_can_hold():
-    stream = np.zeros(3, ev.STREAM_DTYPE)
+    stream = np.zeros(3, event_field.STREAM_DTYPE)
     stream["p"], stream["t"] = 1, [0, 10, 100]
     with pytest.raises(ValueError, match="unevenly"):
         event_fields.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
@@ -287,7 +286,7 @@ def test_collect_refuses_a_stream_that_no_field_can_hold():
 
 def test_an_empty_window_has_an_empty_stream():
     still = jnp.full((3, HEIGHT, WIDTH), 0.5)
-    stream = ev.to_stream(host(run(PAPER, memory_of(PAPER, 0), still)[0]))
+    stream = event_field.to_stream(host(run(PAPER, memory_of(PAPER, 0), still)[0]))
     assert len(stream) == 0
     assert not np.any(event_fields.collect(stream, TIMES, HEIGHT, WIDTH).count)
 
@@ -323,19 +322,19 @@ def test_a_field_says_that_events_divide_the_window_where_they_do(config, frames
 
 def test_the_event_picture_paints_on_red_and_off_blue():
     for background, blank in (("white", 255), ("black", 0)):
-        picture = ev.event_picture(np.array([[3, -1, 0]]), background)
+        picture = event_field.event_picture(np.array([[3, -1, 0]]), background)
         red, blue, none = picture[0].astype(int)
         assert picture.dtype == np.uint8 and red[0] > red[2] + 50 and blue[2] > blue[0] + 50
         assert np.all(none == blank)
     with pytest.raises(ValueError, match="background"):
-        ev.event_picture(np.zeros((1, 1)), "green")
+        event_field.event_picture(np.zeros((1, 1)), "green")
 
 
 def test_frames_and_times_must_match():
     with pytest.raises(ValueError, match="two frames"):
-        ev.generate_events(PAPER, memory_of(PAPER, 0), jnp.ones((1, 2, 2)), (0.0,), jax.random.key(0))
+        event_laws.generate_events(PAPER, memory_of(PAPER, 0), jnp.ones((1, 2, 2)), (0.0,), jax.random.key(0))
     with pytest.raises(ValueError, match="rising"):
-        ev.generate_events(PAPER, memory_of(PAPER, 0), jnp.ones((2, 2, 2)), (0.0, 0.0), jax.random.key(0))
+        event_laws.generate_events(PAPER, memory_of(PAPER, 0), jnp.ones((2, 2, 2)), (0.0, 0.0), jax.random.key(0))
 
 
 NOISY = EventsConfig(leak_rate_hz=20.0, shot_rate_hz=40.0, hot_pixel_fraction=0.1, hot_pixel_rate_hz=400.0)
@@ -344,7 +343,7 @@ NOISY = EventsConfig(leak_rate_hz=20.0, shot_rate_hz=40.0, hot_pixel_fraction=0.
 @pytest.mark.slow
 def test_noise_rates_are_the_configured_ones():
     size = 200
-    memory = ev.reset_memory(NOISY, size, size, jax.random.key(1))
+    memory = event_memory.reset_memory(NOISY, size, size, jax.random.key(1))
     still = jnp.full((3, size, size), 0.5)
     field = host(run(NOISY, memory, still)[0])
     assert field.count.shape == (4, size, size)
@@ -357,7 +356,7 @@ def test_noise_rates_are_the_configured_ones():
     assert abs(count[hot].mean() / (460.0 * 0.04) - 1.0) < 0.02
     off = (field.count * (field.polarity < 0)).sum(0)[~hot].mean() / (20.0 * 0.04)
     assert abs(off - 1.0) < 0.03
-    t = ev.to_stream(field)["t"]
+    t = event_field.to_stream(field)["t"]
     assert t[0] >= 0 and t[-1] < 40_000
     # Uniform in time: the mean of n uniform stamps has standard error 0.04 / sqrt(12 n) = 3e-5 s.
     assert abs(t.mean() * 1e-6 - 0.02) < 2e-4
@@ -374,9 +373,9 @@ def parts(config, memory, frames):
     """Signal and noise apart, and what the camera shows; one key."""
     quiet = dataclasses.replace(config, **dict.fromkeys(BUSY, 0.0))
     key, times = jax.random.key(KEY), np.array(TIMES)
-    signal, _ = ev.generate_events(quiet, memory, frames, TIMES, key)
-    noise = ev.noise_events(config, memory.hot, signal.count, times - times[0], key)
-    shown, _ = ev.generate_events(config, memory, frames, TIMES, key)
+    signal, _ = event_laws.generate_events(quiet, memory, frames, TIMES, key)
+    noise = event_noise.noise_events(config, memory.hot, signal.count, times - times[0], key)
+    shown, _ = event_laws.generate_events(config, memory, frames, TIMES, key)
     return signal, noise, shown
 
 
@@ -406,7 +405,7 @@ def test_no_mean_makes_bursts_of_noise(monkeypatch):
 def test_each_frame_pair_has_the_noise_of_its_own_length():
     config = dataclasses.replace(Config().events, shot_rate_hz=200.0, refractory_ns=5e6)
     times = np.array([0.0, 0.005, 0.04])
-    field = ev.noise_events(config, None, jnp.zeros((2, 100, 100), jnp.int32), times, jax.random.key(KEY))
+    field = event_noise.noise_events(config, None, jnp.zeros((2, 100, 100), jnp.int32), times, jax.random.key(KEY))
     count = np.asarray(field.count).reshape(2, 2, 100, 100).sum(0).mean((1, 2))
     # 200 Hz in 5 ms, at most one event a pixel: 1 - exp(-1), and in 35 ms, at most seven, with a mean of 7.
     sevens = sum(min(k, 7) * math.exp(-7 + k * math.log(7) - math.lgamma(k + 1)) for k in range(60))
@@ -418,10 +417,12 @@ def test_each_frame_pair_has_the_noise_of_its_own_length():
 def test_signal_and_noise_are_merged_as_by_the_plain_loop(seed, law):
     config = dataclasses.replace(FIRING[law], **BUSY)
     signal, noise, shown = map(host, parts(config, memory_of(config, seed), jnp.asarray(random_frames(seed))))
-    one, other = ([(t * 1e-6, x, y, p) for t, x, y, p in ev.to_stream(each).tolist()] for each in (signal, noise))
+    one, other = (
+        [(t * 1e-6, x, y, p) for t, x, y, p in event_field.to_stream(each).tolist()] for each in (signal, noise)
+    )
     plain = events_plain.merged(one, other, np.array(TIMES), config.refractory_ns)
     assert min(len(one), len(other)) > 5
-    stream = ev.to_stream(shown)
+    stream = event_field.to_stream(shown)
     for name, field in (("count", shown.count), ("stream", stream)):
         assert (field.sum() if name == "count" else len(field)) == len(plain)
     ours = np.sort(stream, order=["y", "x", "p", "t"])
@@ -438,16 +439,18 @@ def test_no_row_tells_noise_from_signal(law):
     config = dataclasses.replace(FIRING[law], **BUSY)
     signal, noise, shown = parts(config, memory_of(config, 3), jnp.asarray(random_frames(3)))
     times = np.array(TIMES) - TIMES[0]
-    split = ev.split_polarity(signal)
+    split = event_noise.split_polarity(signal)
     assert np.all(np.asarray(shown.polarity[:2]) >= 0) and np.all(np.asarray(shown.polarity[2:]) <= 0)
     for half in (slice(0, 2), slice(2, 4)):
         assert np.any(split.count[half]) and np.any(noise.count[half])
-    exchanged = ev.merge_fields(config, noise, split, times)
+    exchanged = event_noise.merge_fields(config, noise, split, times)
     has = np.asarray(shown.count) > 0
     for name in ("count", "polarity", "t_first", "t_step"):
         one, other = (np.asarray(getattr(field, name)) for field in (shown, exchanged))
         np.testing.assert_allclose(one[has], other[has], rtol=1e-5, atol=1e-9)  # two programs
-    np.testing.assert_array_equal(ev.event_image(shown), ev.event_image(signal) + ev.event_image(noise))
+    np.testing.assert_array_equal(
+        event_field.event_image(shown), event_field.event_image(signal) + event_field.event_image(noise)
+    )
 
 
 @pytest.mark.parametrize("law", ["paper", "airsim", "binding esim"])
@@ -457,7 +460,7 @@ def test_noise_obeys_the_refractory_period_of_its_pixel(law):
     rng = np.random.default_rng(1)
     frames = jnp.asarray(np.exp(rng.uniform(-3.0, 0.0, (3, HEIGHT, WIDTH))).astype(np.float32))
     signal, _, shown = map(host, parts(config, memory_of(config, 5), frames))
-    limit = ev.max_events(config, 0.02)
+    limit = events.max_events(config, 0.02)
     together = shown.count[:2] + shown.count[2:]
     assert np.all((together == limit) | (signal.count >= limit)) and np.all(shown.count.sum(0) >= signal.count.sum(0))
     steps = shown.t_step[shown.count > 1]
@@ -468,7 +471,7 @@ def test_noise_obeys_the_refractory_period_of_its_pixel(law):
 
 def test_threshold_mismatch_spreads_where_pixels_begin_to_fire():
     config = EventsConfig(threshold=0.1, tolerance=0.1, threshold_mismatch=0.2)
-    memory = ev.reset_memory(config, 100, 100, jax.random.key(2))
+    memory = event_memory.reset_memory(config, 100, 100, jax.random.key(2))
     frames = jnp.full((2, 100, 100), 0.2).at[1].set((0.2 + 1e-3) * np.exp(0.1 * 1.2) - 1e-3)
     field, _ = run(config, memory, frames, (0.0, 0.02))
     # A change of 1.2 thresholds reaches pixels whose threshold is under one deviation too high: 84.1 %.
@@ -476,5 +479,7 @@ def test_threshold_mismatch_spreads_where_pixels_begin_to_fire():
 
 
 def test_a_perfect_sensor_draws_no_random_numbers():
-    trace = jax.make_jaxpr(lambda k, f: ev.generate_events(PAPER, ev.EventMemory(None, None, None, None), f, TIMES, k))
+    trace = jax.make_jaxpr(
+        lambda k, f: event_laws.generate_events(PAPER, event_memory.EventMemory(None, None, None, None), f, TIMES, k)
+    )
     assert "random" not in str(trace(jax.random.key(0), jnp.ones((3, 2, 2))))

@@ -11,7 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig, EventsConfig, ExposureConfig, LightConfig
+from edqn_jax.config import (
+    SENSORS,
+    CameraConfig,
+    Config,
+    DroneConfig,
+    EnvConfig,
+    EventsConfig,
+    ExposureConfig,
+    LightConfig,
+)
 from edqn_jax.config.loading import with_conditions
 from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
@@ -20,14 +29,14 @@ from edqn_jax.learn import actor, policy
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import stack_scenes
-from edqn_jax.sim.sensors import contrast, light, photoreceptor
-from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.sensors import contrast, event_field, event_laws, event_memory, light, photoreceptor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.task import task_of
 from tests.support.event_frames import PAPER, host, memory_of, random_frames, run
 from tests.support.miniature import WORLD
+from tests.support.registries import keep_as_they_are
 
 LIT = Config(
     camera=CameraConfig(width=16, height=12),
@@ -73,7 +82,7 @@ def test_without_light_no_sensor_knows_of_it(world):
     assert len(jax.tree.leaves(state.memory)) == 0
 
 
-def lit(config: EventsConfig, lux: float | None, frames, key: int = 3) -> ev.EventField:
+def lit(config: EventsConfig, lux: float | None, frames, key: int = 3) -> event_field.EventField:
     memory = memory_of(config, 0, *frames.shape[1:])
     if lux is not None:
         memory = dataclasses.replace(memory, lux=jnp.float32(lux))
@@ -161,6 +170,26 @@ def test_light_is_told_only_where_there_is_some_and_of_sensors_that_depend_on_it
         about_policy(dataclasses.replace(blind, env=EnvConfig()))
 
 
+def test_an_own_sensor_that_exposes_or_makes_events_is_told_its_light(world, monkeypatch):
+    keep_as_they_are(monkeypatch)
+    frames = SENSORS.get("frames")
+    SENSORS.register("mine", dataclasses.replace(frames))
+    SENSORS.register("counts", dataclasses.replace(SENSORS.get("event-image")))
+    told = dataclasses.replace(LIT, light=LightConfig(0.1, 10_000.0, told=True), env=EnvConfig(sensor="mine"))
+    with pytest.raises(ConfigError, match="exposure.real must be true with light.told and env.sensor mine"):
+        validate(told)
+    for sensor in ("mine", "counts"):
+        real = dataclasses.replace(told, exposure=ExposureConfig(real=True), env=EnvConfig(sensor=sensor))
+        validate(real)
+        state, seen = jax.jit(lambda key, config=real: env.reset(config, world, key))(jax.random.key(0))
+        assert float(seen.own[OWN_SIZE]) == pytest.approx(float(light.value_of(state.memory.lux)), abs=1e-6)
+    blank = {"show": lambda *_: (jnp.zeros((1, 12, 16)), None), "at_rest": lambda config, key: None}
+    SENSORS.register("forgets", dataclasses.replace(frames, **blank))
+    real = dataclasses.replace(real, env=EnvConfig(sensor="forgets"))
+    with pytest.raises(ConfigError, match="memory of the sensor 'forgets' must have the episode's `lux`"):
+        jax.eval_shape(lambda key: env.reset(real, world, key), jax.random.key(0))
+
+
 def test_a_policy_is_flown_in_other_light_than_it_was_trained_in():
     darker = with_conditions(Config(), {"light": {"least_lux": 0.5, "most_lux": 0.5}}, "conditions")
     assert darker.light == LightConfig(0.5, 0.5)
@@ -183,8 +212,10 @@ def test_a_policy_acts_on_events_with_and_without_noise():
     frames = jnp.exp(jnp.asarray(np.random.default_rng(0).normal(-1.0, 0.3, (2, 12, 16)))).clip(0.0, 1.0)
     seen = []
     for config in (quiet, noisy):
-        memory = ev.reset_memory(config.events, 12, 16, jax.random.key(0))
-        field, _ = ev.generate_events(config.events, memory, frames, config.events.frame_times_s, jax.random.key(1))
+        memory = event_memory.reset_memory(config.events, 12, 16, jax.random.key(0))
+        field, _ = event_laws.generate_events(
+            config.events, memory, frames, config.events.frame_times_s, jax.random.key(1)
+        )
         seen.append(Observation(field, jnp.ones(OWN_SIZE), jnp.ones(MOTION_SIZE)))
     assert seen[0].sensed.count.shape[0] * 2 == seen[1].sensed.count.shape[0] == 2
     codes = [flies.code(each) for each in seen]

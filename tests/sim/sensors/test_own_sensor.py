@@ -19,7 +19,8 @@ from edqn_jax.interop import functional
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.samples import Samples, mirror_samples
 from edqn_jax.sim.sensors import sensor
-from edqn_jax.sim.sensors.events import EventField, event_image, random_field
+from edqn_jax.sim.sensors.event_field import EventField, event_image
+from edqn_jax.sim.sensors.event_laws import random_field
 from edqn_jax.sim.sensors.sensor import EVENT_FIELD, Image, Sensor
 from edqn_jax.sim.task.env import check_sensor
 from edqn_jax.sim.task.observation import MIRRORED_MOTION

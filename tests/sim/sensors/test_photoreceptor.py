@@ -18,8 +18,7 @@ from edqn_jax.config.rules import validate
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import stack_scenes
-from edqn_jax.sim.sensors import events as ev
-from edqn_jax.sim.sensors import photoreceptor, sensor
+from edqn_jax.sim.sensors import event_laws, event_memory, events, photoreceptor, sensor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from tests.oracles import photoreceptor_plain
@@ -93,10 +92,10 @@ def test_the_same_contrast_makes_fewer_events_in_a_dark_pixel_than_in_a_bright_o
     config = dataclasses.replace(law, airsim_tolerance=0.1, refractory_ns=1000.0, log_epsilon=1e-9, **SLOW)
     before = jnp.array([0.02, 0.08, 0.4])[None, :]
     frames = jnp.stack([before, before * 2.0])
-    memory = ev.reset_memory(config, 1, 3, jax.random.key(0))
+    memory = event_memory.reset_memory(config, 1, 3, jax.random.key(0))
     if memory.residual is not None:
         memory = dataclasses.replace(memory, residual=jnp.zeros((1, 3)))
-    field, _ = ev.generate_events(config, memory, frames, (0.0, 0.04), jax.random.key(0))
+    field, _ = event_laws.generate_events(config, memory, frames, (0.0, 0.04), jax.random.key(0))
     dark, middle, bright = np.asarray(field.count[0, 0])
     assert 0 <= dark < middle < bright <= np.log(2) / 0.09
 
@@ -124,7 +123,9 @@ def test_the_lag_of_an_episode_is_that_of_one_filter_over_all_of_it(law, lux):
     frames = long_flight(6, 18)
     times = np.concatenate([0.26 * k + np.array(TIMES) for k in range(6)])
     memory = dataclasses.replace(memory_of(config, 3), lux=jnp.float32(lux))
-    level = (ev.airsim_log_brightness(frames) if law is AIRSIM else ev.log_brightness(config, frames)).__array__()
+    level = (
+        events.airsim_log_brightness(frames) if law is AIRSIM else events.log_brightness(config, frames)
+    ).__array__()
     shown = photoreceptor_plain.follow(30.0 * lux / 10.0, level, times, frames, np.zeros(level.shape[1:]), parts=2000)
     changes = []
     for k in range(6):
@@ -187,7 +188,9 @@ def test_what_esim_shows_is_the_photoreceptor_within_one_threshold():
 
 
 def test_infinite_bandwidth_traces_nothing():
-    trace = jax.make_jaxpr(lambda k, f: ev.generate_events(PAPER, ev.EventMemory(None, None, None, None), f, TIMES, k))
+    trace = jax.make_jaxpr(
+        lambda k, f: event_laws.generate_events(PAPER, event_memory.EventMemory(None, None, None, None), f, TIMES, k)
+    )
     plain = str(trace(jax.random.key(0), jnp.ones((3, 2, 2))))
     assert "exp" not in plain and EventsConfig().bandwidth_hz == 0
 

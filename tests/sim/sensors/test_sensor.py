@@ -26,7 +26,7 @@ from edqn_jax.sim.physics.drone import Flight, hover_state
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import stack_scenes, take_scene
 from edqn_jax.sim.sensors import sensor
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.sensors.sensor import Sensor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.action_sets import velocity_command

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import EventsConfig
-from edqn_jax.sim.sensors import events as ev
-from edqn_jax.sim.sensors import poisson
+from edqn_jax.sim.sensors import event_field, poisson
 from tests.oracles import sensor_pixels_plain as plain
 from tests.support.event_frames import TIMES, host, memory_of, run
 
@@ -41,7 +40,7 @@ def test_counts_are_those_of_pixels_one_by_one(mismatch, change):
     error = 5 * np.std(wanted) / 600**0.5
     assert field.count.mean() == pytest.approx(np.mean(wanted), abs=error + 0.02 * mismatch * np.mean(wanted) + 0.1)
     assert field.count.std() == pytest.approx(np.std(wanted), rel=0.25)
-    np.testing.assert_allclose(ev.in_units(field), field.count / N, rtol=1e-6)
+    np.testing.assert_allclose(event_field.in_units(field), field.count / N, rtol=1e-6)
 
 
 def test_pixels_with_memory_have_backlash_and_no_steps():

@@ -21,7 +21,7 @@ from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
-from edqn_jax.sim.sensors import events, sensor
+from edqn_jax.sim.sensors import event_laws, event_memory, sensor
 from edqn_jax.sim.task import decision, env, outcomes
 from edqn_jax.sim.task.action_sets import heading_setpoint, heading_to_goal, velocity_command
 from edqn_jax.sim.task.decision import Decision, Payment, Situation, reset_decision
@@ -622,8 +622,8 @@ def test_events_are_those_between_the_configured_frames_of_the_flight(reset, ste
     result = steps[-1]
     see = jax.jit(lambda p, q: camera.render_luma(FLOWN.camera, SCENE, p, sensor.mount_rotation(FLOWN, q)))
     frames = jnp.stack([see(result.flight.position[i], result.flight.quaternion[i]) for i in (10, 12)])
-    memory = events.reset_memory(FLOWN.events, 24, 32, jax.random.key(0))
-    field, _ = events.generate_events(FLOWN.events, memory, frames, (-0.04, 0.0), jax.random.key(1))
+    memory = event_memory.reset_memory(FLOWN.events, 24, 32, jax.random.key(0))
+    field, _ = event_laws.generate_events(FLOWN.events, memory, frames, (-0.04, 0.0), jax.random.key(1))
     got = result.observation.sensed
     assert int(jnp.sum(field.count)) > 20
     # Two compilations may differ in the last digit, and with it in a rare event on the threshold.

@@ -23,7 +23,7 @@ from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.environment import make
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.scene import build_scene, stack_scenes
-from edqn_jax.sim.sensors.events import event_image
+from edqn_jax.sim.sensors.event_field import event_image
 from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.missions import Missions

@@ -25,7 +25,7 @@ from edqn_jax.sim.scene.launches import aim_along
 from edqn_jax.sim.scene.motion import Motion, Throw, aim_at, ball_positions, throw_speeds
 from edqn_jax.sim.scene.scene import PARKED, Spheres, UprightBoxes, build_scene, scene_at, stack_scenes
 from edqn_jax.sim.sensors import built_in, sensor
-from edqn_jax.sim.sensors.events import event_image
+from edqn_jax.sim.sensors.event_field import event_image
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.missions import own_missions

@@ -14,8 +14,8 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.physics import drone
-from edqn_jax.sim.sensors import contrast, events
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors import contrast, event_field
+from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.sensors.sensor import frame_steps
 from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
 from edqn_jax.sim.task.observation import knows_contrast
@@ -62,7 +62,7 @@ def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int =
             "attitudes": path[list(frame_steps(config))],
         }
         told = float(contrast.contrast_of(seen.motion[-1])) if knows_contrast(config) else None
-        packet = events.to_stream(_field(config, seen.sensed, told))
+        packet = event_field.to_stream(_field(config, seen.sensed, told))
         packet["t"] += until_us - window_us
         setpoint = float(heading_setpoint(config.env, body, jax.numpy.asarray(goal), command))
         own, motion = np.asarray(seen.own), np.asarray(seen.motion)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from edqn_jax.interop.recordings.recording import Recording
-from edqn_jax.sim.sensors.events import STREAM_DTYPE
+from edqn_jax.sim.sensors.event_field import STREAM_DTYPE
 
 WIDTH, HEIGHT = 64, 48
 
