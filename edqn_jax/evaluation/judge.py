@@ -220,7 +220,7 @@ def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLi
     reach = np.where(plane, np.inf, model.geom_rbound[solids])
     moving = tuple(_moving(model, data, solids, volume))
     start, goal = (np.array(data.site(n).xpos) if n in _sites(model) else np.zeros(3) for n in ("start", "goal"))
-    meshes = triangle_solids(model, data, solids)
+    meshes = triangle_solids(model, solids)
     return MujocoWorld(model, data, probe, solids, reach, moving, FlightTrack(start, goal), meshes)
 
 
@@ -278,7 +278,8 @@ def clearance(
             break
         geom = int(judge.solids[index])
         if geom in judge.meshes:
-            distance = judge.meshes[geom].distance(np.asarray(position, np.float64)) - radius
+            place = (np.asarray(position) - data.geom_xpos[geom]) @ data.geom_xmat[geom].reshape(3, 3)
+            distance = judge.meshes[geom].distance(place) - radius
         else:
             distance = mujoco.mj_geomDistance(judge.model, data, geom, judge.probe, _FARTHEST_M, None)
         if distance < nearest:

@@ -22,10 +22,10 @@ _CONVEX = 1e-3  # share of its hull that a mesh of which C MuJoCo is the judge m
 
 @dataclass(frozen=True)
 class TriangleSolid:
-    """Triangles at rest, by their middles."""
+    """Triangles of a geom, by their middles."""
 
     triangles: NDArray[np.float64]
-    """[F, 3, 3] metres, in the world's frame."""
+    """[F, 3, 3] metres, in the geom's axes, which MuJoCo moves with its body."""
     tree: KDTree
     reach: float
     """Most metres from the middle of a triangle to its corners."""
@@ -33,7 +33,7 @@ class TriangleSolid:
     """Metres that a surface with a thickness reaches to either side."""
 
     def distance(self, point: NDArray[np.float64]) -> float:
-        """Returns metres from a point [3] to the surface; a point within is not told from one outside."""
+        """Returns metres from a point [3] in the geom's axes to the surface, on whichever side of it."""
         from trimesh.triangles import closest_point
 
         middle, _ = self.tree.query(point)
@@ -42,14 +42,8 @@ class TriangleSolid:
         return float(np.sqrt(np.min(np.sum((nearest - point) ** 2, axis=1)))) - self.half
 
 
-def triangle_solids(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[np.int64]) -> dict[int, TriangleSolid]:
-    """Returns those of the geoms, by their numbers, that C MuJoCo does not judge.
-
-    Args:
-        model: of the world.
-        data: with the places of its bodies.
-        geoms: [N] numbers.
-    """
+def triangle_solids(model: mujoco.MjModel, geoms: NDArray[np.int64]) -> dict[int, TriangleSolid]:
+    """Returns those of the geoms [N], by their numbers, that C MuJoCo does not judge."""
     found = {}
     for geom in geoms:
         kind, number = model.geom_type[geom], model.geom_dataid[geom]
@@ -63,8 +57,7 @@ def triangle_solids(model: mujoco.MjModel, data: mujoco.MjData, geoms: NDArray[n
                 continue
         else:
             continue
-        placed = vertices @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
-        found[int(geom)] = _solid(placed, faces, thickness_of(model, geom))
+        found[int(geom)] = _solid(vertices, faces, thickness_of(model, geom))
     return found
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -13,7 +15,10 @@ from edqn_jax.evaluation.judge import MujocoWorld, clearance, load_judge, replay
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.verdicts import Agreement, check_verdicts
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.mjcf_parts.files import load_checked_text
+from edqn_jax.sim.scene.scene import scene_at
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.oracles.mesh_distance import signed_distances
 from tests.support.meshes import CUBE, hull, mesh_world
@@ -22,6 +27,7 @@ from tests.support.policies import CONFIG, always
 RADIUS = 0.36
 RING = trimesh.creation.torus(1.2, 0.2, major_sections=24, minor_sections=10)
 GATE = np.asarray(RING.vertices)[:, [2, 0, 1]], np.asarray(RING.faces)  # to be flown through along x
+MESHES = {"gate": GATE, "block": hull(CUBE * 0.5)}
 GEOMS = (
     '<geom name="gate" type="mesh" mesh="gate" pos="8 5 3"/><geom name="block" type="mesh" mesh="block" pos="13 5 3"/>'
     '<geom name="egg" type="ellipsoid" size=".5 1 .4" pos="13 8 3"/>'
@@ -30,7 +36,7 @@ GEOMS = (
 
 @pytest.fixture
 def world(tmp_path: Path) -> Path:
-    return mesh_world(tmp_path, GEOMS, gate=GATE, block=hull(CUBE * 0.5))
+    return mesh_world(tmp_path, GEOMS, **MESHES)
 
 
 @pytest.fixture
@@ -56,10 +62,49 @@ def test_convex_meshes_and_ellipsoids_are_c_mujocos(judge: MujocoWorld) -> None:
 def test_its_distance_is_that_to_the_nearest_of_all_triangles(judge: MujocoWorld) -> None:
     points = np.random.default_rng(0).uniform((6, 3, 1), (10, 7, 5), (60, 3))
     triangles = GATE[0][GATE[1]] + [8, 5, 3]
-    (solid,) = judge.meshes.values()
-    np.testing.assert_allclose(
-        [solid.distance(point) for point in points], np.abs(signed_distances(triangles, points)), atol=1e-6
-    )
+    expected = np.abs(signed_distances(triangles, points)) - RADIUS
+    near = [(*clearance(judge, point), there) for point, there in zip(points, expected, strict=True)]
+    near = [(distance, there) for distance, name, there in near if name == "gate"]
+    assert len(near) > 30
+    np.testing.assert_allclose(*np.transpose(near), atol=1e-6)
+
+
+MOVING = (
+    '<body name="a" mocap="true" pos="8 5 3" euler="0 0 40"><geom name="gate" type="mesh" mesh="gate"/>'
+    '<body pos="0 0 2.5"><geom name="egg" type="ellipsoid" size=".5 1 .4" euler="20 0 0"/></body></body>'
+    '<body name="b" mocap="true" pos="13 5 3"><geom name="block" type="mesh" mesh="block" euler="0 30 10"/></body>'
+)
+TEXTS = (
+    '<custom><text name="motion:a" data="oscillate 0.5 2 0.4 6 0.1"/>'
+    '<text name="motion:b" data="bounce 0 -1.5 0.2; circle 0.5 3 0"/></custom></mujoco>'
+)
+
+
+@pytest.fixture
+def moving(tmp_path: Path) -> Path:
+    """The gate and the block on bodies that move, the gate turned."""
+    file = mesh_world(tmp_path, MOVING, **MESHES)
+    file.write_text(file.read_text().replace("</mujoco>", TEXTS))
+    return file
+
+
+def test_meshes_that_move_are_judged_where_they_are(moving: Path) -> None:
+    judge, scene = load_judge(mujoco.MjSpec.from_string(load_checked_text(moving)), RADIUS), load_scene(moving)
+    rng, found = np.random.default_rng(1), []
+    cos, sin = np.cos(np.radians(40)), np.sin(np.radians(40))
+    turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+    ours = jax.jit(lambda point, time: signed_distance(scene_at(scene, time), point))
+    for time in np.linspace(0, 20, 300):
+        point = rng.uniform((6, 2, 1.5), (15, 8, 5))
+        distance, name = clearance(judge, point, time)
+        found.append((float(ours(jnp.asarray(point, jnp.float32), jnp.float32(time))) - RADIUS, distance))
+        if name == "gate":
+            away = np.array([0.5, 2, 0.4]) * (np.sin(2 * np.pi * (time / 6 + 0.1)) - np.sin(0.2 * np.pi))
+            (exact,) = np.abs(signed_distances(GATE[0][GATE[1]] @ turn.T + [8, 5, 3] + away, point[None]))
+            assert distance == pytest.approx(exact - RADIUS, abs=1e-6)
+    # Within a solid trimesh's distances are not negative.
+    grid, exact = np.transpose([each for each in found if each[0] > -RADIUS and each[1] < 0.5 - RADIUS])
+    assert len(grid) > 15 and np.all(grid - exact < 0.011) and np.all(exact - grid < 0.1)
 
 
 def test_the_ground_of_a_height_field_is_judged(tmp_path: Path) -> None:
@@ -96,7 +141,10 @@ def test_where_distances_may_be_too_small_contacts_may_be_early(
 
 
 @pytest.mark.slow
-def test_flights_at_meshes_of_any_form_are_judged_alike(world: Path) -> None:
+@pytest.mark.parametrize("moves", [False, True])
+def test_flights_at_meshes_of_any_form_are_judged_alike(world: Path, moves: bool) -> None:
+    if moves:
+        world.write_text(mesh_world(world.parent, MOVING, **MESHES).read_text().replace("</mujoco>", TEXTS))
     course = load_missions(CONFIG, str(world), 60)
     flights = fly_on_all_devices(CONFIG, course.env_params, always((1, 0, 0)), record=True)
     results = check_verdicts(CONFIG, course, flights)

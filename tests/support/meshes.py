@@ -30,12 +30,21 @@ def ball(count: int = 60) -> tuple[np.ndarray, np.ndarray]:
     return hull(np.stack([around * np.cos(turn), around * np.sin(turn), height], axis=1))
 
 
+def bracket() -> tuple[np.ndarray, np.ndarray]:
+    """A mesh that is not convex: an upright board with a shelf, two boxes side by side."""
+    parts = [hull(CUBE * [0.2, 0.9, 0.8] + [-0.6, 0, 0.2]), hull(CUBE * [0.6, 0.5, 0.2] + [0.2, 0, -0.3])]
+    return np.concatenate([part[0] for part in parts]), np.concatenate([parts[0][1], parts[1][1] + 8])
+
+
+def mesh_asset(name: str, vertices: np.ndarray, faces: np.ndarray) -> str:
+    """The mesh as MJCF has it."""
+    vertex, face = " ".join(f"{x:.9g}" for x in np.ravel(vertices)), " ".join(map(str, np.ravel(faces)))
+    return f'<mesh name="{name}" vertex="{vertex}" face="{face}"/>'
+
+
 def mesh_world(folder: Path, geoms: str, **meshes: tuple[np.ndarray, np.ndarray]) -> Path:
     """An MJCF file with a ground, these geoms and these meshes."""
-    made = ""
-    for name, (vertices, faces) in meshes.items():
-        vertex, face = " ".join(f"{x:.9g}" for x in np.ravel(vertices)), " ".join(map(str, np.ravel(faces)))
-        made += f'<mesh name="{name}" vertex="{vertex}" face="{face}"/>'
+    made = "".join(mesh_asset(name, *mesh) for name, mesh in meshes.items())
     sites = '<site name="start" pos="1 5 3"/><site name="goal" pos="19 5 3"/>'
     sites += '<site name="volume" type="box" pos="10 5 3" size="10 5 3" group="3"/>'
     file = folder / "meshes.xml"

@@ -18,12 +18,14 @@ from edqn_jax.report.worlds.flights import plot_path, plot_world
 from edqn_jax.report.worlds.solids import MAP, make_cutaway, moving_solids, solids_of, static_scene
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.physics.airframe import load_airframe
+from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.motion import Motion, Throw
 from edqn_jax.sim.scene.scene import PARKED, Planes, Scene, Spheres, UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from tests.support.box_flight import SMALL, Drawn, a_flight, recorded
+from tests.support.meshes import bracket, mesh_world
 
 RED, GREY = np.array([0.9, 0.05, 0.05]), np.full(3, 0.5)
 SLIDING = Motion((0, 4, 0), (0, -9, 0), (0, 9, 0), np.zeros((2, 3)), 0.0)
@@ -52,6 +54,25 @@ def test_solids_that_move_are_where_they_are_at_a_time_and_the_others_stand():
         np.testing.assert_allclose(box.corners.mean(0), [12, middle, 4], atol=1e-4)
     # The ball meets the drone at 15 m, after 3.75 s, and is thrown 1.5 s before.
     assert [len(moving_solids(scene, time)) for time in (2.0, 3.0, 30.0)] == [1, 2, 1]
+
+
+def test_a_mesh_that_moves_is_drawn_and_shown_on_the_page_where_it_is(tmp_path):
+    vertices, faces = bracket()
+    geom = '<body name="b" mocap="true" pos="9 5 3" euler="0 0 90"><geom type="mesh" mesh="m"/></body>'
+    text = '<custom><text name="motion:b" data="oscillate 0 2 0 4 0"/></custom>'
+    file = mesh_world(tmp_path, geom, m=(vertices, faces))
+    file.write_text(file.read_text().replace("</mujoco>", text + "</mujoco>"))
+    scene = load_scene(file)
+    assert solids_of(static_scene(scene)) == []
+    turned = vertices @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    for time, away in ((0.0, 0.0), (1.0, 2.0), (3.0, -2.0)):
+        corners = np.concatenate([solid.corners for solid in moving_solids(scene, time)]) - [9, 5 + away, 3]
+        for edge in (np.min, np.max):  # parts are made of cells of 0.1 m
+            np.testing.assert_allclose(edge(corners, axis=0), edge(turned, axis=0), atol=0.11)
+    (shown,) = world_data(scene)["shapes"]
+    assert shown["kind"] == "mesh" and shown["moves"]["swing"][1] == [0, 2, 0] and "closes" not in shown
+    place = np.reshape(shown["turn"], (3, 3)) @ np.transpose(shown["vertices"]) + np.reshape(shown["at"], (3, 1))
+    np.testing.assert_allclose(np.ptp(place, axis=1), np.ptp(turned, axis=0), atol=2e-3)
 
 
 def test_a_still_picture_outlines_what_moves_and_says_so(tmp_path):

@@ -8,7 +8,7 @@ of textures are not looked for. A world for the drone consists of
   MuJoCo's viewer (groups 0 to 2) or if MuJoCo would collide with it (contype or conaffinity set): every
   visible geom is solid, and every solid geom is visible. Colour is the material's or the geom's own `rgba`; alpha
   and textures are ignored. Patterns and light are those of `<custom>` numerics (`mjcf_parts/looks.py`).
-* its moving geoms, on mocap bodies whose motion a text says (`mjcf_parts/motion.py`).
+* its moving geoms, of any kind but planes, on mocap bodies whose motion a text says (`mjcf_parts/motion.py`).
 * two sites `start` and `goal`, of which only the positions are read.
 * a box site `volume`, not rotated: the space that the drone may fly in. Without one, the box around all
   shapes and sites, `VOLUME_MARGIN` wider on every side, but not below a level plane; an evaluation whose start or goal

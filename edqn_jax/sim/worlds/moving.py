@@ -102,7 +102,7 @@ def _with_moving_bodies(scene: Scene, moving: Moving, bodies: Bodies, key: Array
         """The world in which these bodies [count] bool move."""
         fields: dict[str, Any] = {}
         for kind, numbers in bodies.items():
-            shapes, of = getattr(scene, kind), np.array(numbers)
+            shapes, of = scene.shapes()[kind], np.array(numbers)
             moves = keep[of] & (shapes.position[:, 0] < PARKED / 2)
             motion = jax.tree.map(lambda leaf, of=of: leaf[of], drawn)
             motion = _between_faces(motion, shapes, scene.volume)
@@ -111,7 +111,7 @@ def _with_moving_bodies(scene: Scene, moving: Moving, bodies: Bodies, key: Array
                 lambda a, b, m=moves: jnp.where(m.reshape(-1, *[1] * (a.ndim - 1)), a, b), motion, stands
             )
             fields[kind] = dataclasses.replace(shapes, motion=motion)
-        return dataclasses.replace(scene, **fields)
+        return scene.with_shapes(fields)
 
     everything = kept(jnp.ones(count, bool))
 

@@ -162,25 +162,18 @@ def test_pools_hold_worlds_with_and_without_meshes_and_with_others(world: Path, 
     )
 
 
-MOVING = '<body name="b" mocap="true" pos="9 5 3"><geom name="table" type="mesh" mesh="m"/></body>'
-
-
 @pytest.mark.parametrize(
     ("geom", "mesh", "says"),
     [
         (TABLE, (BOARD[0], BOARD[1][1:]), "geom 'table': the mesh is not watertight"),
         (TABLE, (BOARD[0], BOARD[1][:, ::-1]), "geom 'table': the mesh is inside out"),
         (TABLE, (np.full((8, 3), np.nan), BOARD[1]), "is not an MJCF that MuJoCo can read: .* is not finite"),
-        (MOVING, BOARD, "geom 'table' is of the kind mesh on a body that moves"),
     ],
 )
 def test_a_mesh_that_cannot_be_flown_is_refused_by_the_name_of_its_geom(
     tmp_path: Path, geom: str, mesh: tuple[np.ndarray, np.ndarray], says: str
 ) -> None:
     file = mesh_world(tmp_path, geom.replace('mesh="board"', 'mesh="m"'), m=mesh)
-    moves = '<custom><text name="motion:b" data="oscillate 0 1 0 4 0"/></custom></mujoco>'
-    if geom is MOVING:
-        file.write_text(file.read_text().replace("</mujoco>", moves))
     with pytest.raises(SceneError, match=says) as raised:
         mjcf.load_scene(file)
     assert "\n" not in str(raised.value)

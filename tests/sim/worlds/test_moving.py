@@ -9,18 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from edqn_jax.config import FAMILIES
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.sim.environment import make
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.motion import launch_times
-from edqn_jax.sim.scene.scene import PARKED, Scene, has_motion, scene_at, take_scene
+from edqn_jax.sim.scene.scene import PARKED, Scene, build_scene, has_motion, scene_at, take_scene
+from edqn_jax.sim.scene.shapes.kind import Geom, read_shape
 from edqn_jax.sim.task.missions import own_missions, random_missions
 from edqn_jax.sim.worlds import canyon, families, forest
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from edqn_jax.sim.worlds.free_points import CLEARANCE, EARLY_S
 from edqn_jax.sim.worlds.moving import MOVING_SHARE, Moving
+from tests.support.meshes import bracket
+from tests.support.registries import keep_as_they_are
 
 WORLDS = 12
 KEYS = world_keys("validation", WORLDS)
@@ -161,6 +165,19 @@ def test_what_belongs_together_moves_together(family, bodies):
         assert any(len(each) > 1 and np.abs(each).max() > 0.5 for each in shifts.values())
         for each in shifts.values():
             np.testing.assert_allclose(each, np.broadcast_to(each[0], np.shape(each)), atol=1e-4)
+
+
+def test_meshes_of_a_family_of_ones_own_move(monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = Geom("mesh", np.zeros(3), np.eye(3), np.zeros(3), np.full(3, 0.5), mesh=bracket())
+    shapes = [dataclasses.replace(read_shape(mesh), position=place) for place in ([10.0, 4, 4], [20.0, 14, 4])]
+    world = build_scene(shapes, volume=[[0, 0, 0], [30, 20, 10]], start=[2, 10, 4], goal=[28, 10, 4])
+    keep_as_they_are(monkeypatch)
+    family = families.Family(lambda key: world, (30.0, 20.0, 10.0), edge_m=None, bodies={"fields": (0, 1)})
+    FAMILIES.register("brackets", family)
+    pool = random_pool("brackets", KEYS[:4], Moving(share=1.0))
+    now = jax.vmap(lambda scene: scene_at(scene, jnp.float32(2.3)))(pool)
+    away = np.asarray(now.others["fields"].position - world.others["fields"].position)
+    assert np.all(np.linalg.norm(away, axis=2) > 0.1) and np.all(away[..., 2] == 0)
 
 
 @pytest.mark.slow

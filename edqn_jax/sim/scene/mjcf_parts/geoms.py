@@ -61,10 +61,6 @@ def shape_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int, title: str, 
     found = geom_of(model, data, geom)
     if not all(np.all(np.isfinite(values)) for values in (found.position, found.rotation, found.size)):
         raise SceneError(f"{title}: geom '{name}' has a place or a size that is not finite; give it numbers")
-    if moves and found.mesh is not None and not any(kind.geom == found.kind != "mesh" for kind in kinds().values()):
-        raise SceneError(
-            f"{title}: geom '{name}' is of the kind {found.kind} on a body that moves; only what stands may be"
-        )
     try:
         shape = read_shape(found)
     except ConfigError as error:

@@ -1,6 +1,7 @@
 """Fields: solids of any form as grids of signed distances (`sim/scene/mesh_field.py`).
 
-The grids are static: constants of a program, not rows of a world's arrays, which the camera copies for each column.
+Where a field stands, and how it moves, is in a world's arrays; its grid is static, a constant of a program, since the
+camera copies those arrays for each column.
 Between its values a distance is interpolated; beyond its grid a field is at least as far away as the box around the
 mesh, and as the nearest point of the grid together with the distance there.
 """
