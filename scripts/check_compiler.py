@@ -50,6 +50,7 @@ from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop import functional
 from edqn_jax.interop.deployment import onnx_export
 from edqn_jax.keys import run_streams
+from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.xla_flags import YNN_OPTION
@@ -156,9 +157,11 @@ def _fly(policy: Any, missions: int, options: dict[str, Any]) -> Tree:
     """Returns the first two decisions of greedy flights, before a tipped move makes two flights of one."""
     short = dataclasses.replace(policy.config, env=dataclasses.replace(policy.config.env, max_decisions=2))
     world = load_missions(short, "rooms", missions).env_params
-    program = jax.jit(rollouts._fly_all, static_argnums=(0, 1, 2, 3), compiler_options=options)
-    key = run_streams(0).flights
-    return jax.tree.map(_numbers, program(short, False, True, None, world, policy.params, key))
+    program = rollouts._Program(short, AgentActor(short), rollouts.Extras(record=True))
+    begin, fly_on, end = rollouts._programs(None, tuple(options.items()))
+    flying = begin(program, world, policy.params, run_streams(0).flights)
+    flying, _ = fly_on(program, world, policy.params, flying, rollouts.NO_END)
+    return jax.tree.map(_numbers, end(missions, flying))
 
 
 def _step(drones: int, options: dict[str, Any]) -> Tree:

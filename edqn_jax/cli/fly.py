@@ -356,6 +356,7 @@ def simulate(args: FlyArgs) -> None:
         os.environ.setdefault("MUJOCO_GL", "egl")  # read as MuJoCo is imported
 
     from edqn_jax.evaluation.metrics import wilson_interval
+    from edqn_jax.evaluation.world_check import warn_of_training
     from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_missions
     from edqn_jax.fly.simulated.several import fly_at_once
     from edqn_jax.interop.deployment.onnx_export import export_policy
@@ -365,6 +366,9 @@ def simulate(args: FlyArgs) -> None:
     show_phase("exporting the policy")
     policy = load_policy(args.policy)
     asked = args.simulate, policy.config, args.missions, args.seed
+    there = replace(policy.config, world=replace(policy.config.world, name=args.simulate))
+    for warning in warn_of_training(there, policy.config):
+        print(warning)
     ended = []
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file

@@ -84,6 +84,6 @@ def report_command(args: ReportArgs) -> None:
 
         from edqn_jax.report.page.document import build_report
 
-        page = build_report(args.runs, args.missions, say_phase).encode()
+        page = build_report(args.runs, args.missions, say_phase, show_phase).encode()
     write_atomically(args.out, page)
     print(f"'{args.out}' has {len(page) / 1e6:.1f} MB; open it in a browser")

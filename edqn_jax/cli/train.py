@@ -269,7 +269,7 @@ def _open_progress(writes: bool) -> Progress:
     """Returns what shows the progress of a run, in place of the status where that is a panel with clocks of its own."""
     from edqn_jax.report.progress import Progress
 
-    tell = (lambda _: end_status()) if sys.stdout.isatty() else show_phase
+    tell = (lambda *_: end_status()) if sys.stdout.isatty() else show_phase
     return Progress(Console(quiet=not writes), tell=tell)
 
 

@@ -60,7 +60,7 @@ def verify_command(args: VerifyArgs) -> None:
     show_phase("reading the run")
     if args.json is not None:
         check_can_write(args.json)
-    findings = verify_run(args.run, say_phase)
+    findings = verify_run(args.run, say_phase, show_phase)
     Console().print(findings_table(findings))
     if args.json is not None:
         found = {"run": str(args.run), "findings": [dataclasses.asdict(finding) for finding in findings]}

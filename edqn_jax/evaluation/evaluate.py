@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from edqn_jax.evaluation.decoder import check_predicts_distance, summarise_error
 from edqn_jax.evaluation.metrics import shortest_paths, summarise_flights
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.places import Point
-from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.evaluation.rollouts import ShowPhase, fly_on_all_devices, show_nothing
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import Function, FunctionPolicy, actor_of, as_policy, config_of
 from edqn_jax.policies.unseen import describe_unseen
@@ -73,7 +72,7 @@ def evaluate(
     shuffle_codes: bool = False,
     decoder: bool = False,
     conditions: Layer | None = None,
-    phase: Callable[[str], None] | None = None,
+    phase: ShowPhase | None = None,
 ) -> Evaluation:
     """Flies a policy greedily, every mission once, and measures.
 
@@ -93,14 +92,14 @@ def evaluate(
             `decoder.summarise_errors`. True distances are then rendered at every decision.
         conditions: wind and other disturbances, and drones, in place of the policy's own, by group, such as
             `{"air": {"gusts_m_s": 5.0}}`; see `config.CONDITIONS`.
-        phase: called with the name of each phase as it begins, such as `compiling`.
+        phase: called with the name of each phase as it begins, such as `compiling`, and while it flies with how many
+            missions have ended, of how many.
 
     Raises:
         ConfigError: if there is no such world or condition, the missions cannot be flown, the policy cannot fly, or
             there is nothing to shuffle, or no decoder that predicts distance.
     """
     check_not_forked()
-    phase = phase or (lambda _: None)
     policy = as_policy(policy, world)
     config = with_conditions(config_of(policy), conditions or {}, "evaluate")
     if shuffle_codes:
@@ -108,7 +107,8 @@ def evaluate(
     actor = actor_of(policy, config)
     if decoder:
         check_predicts_distance(config, actor)
-    phase("preparing worlds")
+    show = phase or show_nothing
+    show("preparing worlds")
     mission_set = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
     flights = fly_on_all_devices(
         config,
@@ -121,11 +121,9 @@ def evaluate(
         decoder_errors=decoder,
         phase=phase,
     )
-    phase("shortest paths")
+    show("shortest paths")
     shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
-    notes = "\n".join(filter(None, (mission_set.note, *_unseen(policy, config))))
-    mission_set = dataclasses.replace(mission_set, note=notes or None)
-    return Evaluation(mission_set, flights, _figures(config, flights, shortest))
+    return Evaluation(note_unseen(policy, config, mission_set), flights, _figures(config, flights, shortest))
 
 
 def _figures(config: Config, flights: Flights, shortest: np.ndarray) -> dict[str, Any]:
@@ -136,9 +134,12 @@ def _figures(config: Config, flights: Flights, shortest: np.ndarray) -> dict[str
     return figures
 
 
-def _unseen(policy: Policy | FunctionPolicy, config: Config) -> list[str]:
-    """Returns what a policy was not trained with; nothing is known of a function."""
-    return [] if isinstance(policy, FunctionPolicy) else describe_unseen(policy.config, config)
+def note_unseen(policy: Policy | FunctionPolicy, config: Config, missions: MissionSet) -> MissionSet:
+    """Returns missions whose note also says what the policy was not trained with; nothing is known of a function."""
+    if isinstance(policy, FunctionPolicy):
+        return missions
+    unseen = describe_unseen(policy.config, config, None if missions.file is None else missions.scene())
+    return dataclasses.replace(missions, note="\n".join(filter(None, (missions.note, *unseen))) or None)
 
 
 def _check_can_shuffle(config: Config, missions: int) -> None:

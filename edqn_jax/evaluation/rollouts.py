@@ -1,4 +1,4 @@
-"""Greedy rollouts: every mission once, all in parallel, in one compiled program."""
+"""Greedy rollouts: every mission once, all in parallel, in one compiled loop."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ class _Program:
 
 @struct.dataclass
 class _Flying:
-    """Carry of the loop over decisions."""
+    """Carry of the loop over decisions; M missions on D devices, between the loop's pieces with D in front of []."""
 
     state: EnvState
     observation: Observation
@@ -79,6 +79,26 @@ class _Flying:
     key: Array
 
 
+class _Programs(NamedTuple):
+    """Compiled functions of which flying consists."""
+
+    begin: Any
+    """Program, world, parameters and key to `_Flying`."""
+    fly_on: Any
+    """The same without the key, `_Flying` (donated) and a decision, to `_Flying` and how many flights of each device
+    have ended: flies until that decision, or to the end of the last flight."""
+    end: Any
+    """Number of missions and `_Flying` to flights."""
+
+
+NO_END = np.int32(np.iinfo(np.int32).max)
+"""A decision that no flight takes."""
+
+DRONES_A_PIECE = 4096
+"""Decisions of each device in one piece of the loop where it is told how many flights have ended: a fraction of a
+second on a core."""
+
+
 def fly_missions(
     config: Config,
     env_params: EnvParams,
@@ -88,10 +108,11 @@ def fly_missions(
     actor: Actor | None = None,
     extras: Extras = Extras(),
     mesh: Mesh | None = None,
+    tell: Callable[[int, int], None] | None = None,
 ) -> Flights:
     """Flies each of the world's M missions once, greedily.
 
-    Environment i flies mission i; the program ends with the last flight. Environments whose flight has ended
+    Environment i flies mission i; the loop ends with the last flight. Environments whose flight has ended
     fly it again, which is not counted, those of a group when all have ended. M is a multiple of `env.drones`.
 
     Compiles once for each configuration, choice of flags, mesh, and shapes and layout of the arrays.
@@ -105,6 +126,8 @@ def fly_missions(
         extras: recording and measuring.
         mesh: devices, along one axis, to spread the missions over; flights do not depend on it, except for
             which codes are exchanged.
+        tell: called with how many flights have ended, and M: once it is compiled, and as they end. The host then
+            starts the loop piece by piece, which changes no flight; of several processes none is told.
 
     Returns:
         Flights of the M missions, on the devices.
@@ -113,8 +136,22 @@ def fly_missions(
         ConfigError: if the actor's actions are not those of `env.actions`.
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
-    program = _Program(config, actor or AgentActor(config), extras)
-    return _compiled_for(mesh)(program, mesh, env_params, params, key)
+    program, missions = _Program(config, actor or AgentActor(config), extras), _count(env_params)
+    begin, fly_on, end = _programs(mesh)
+    flying = begin(program, env_params, params, key)
+    if tell is None or jax.process_count() > 1:
+        return end(missions, fly_on(program, env_params, params, flying, NO_END)[0])
+    piece = max(1, DRONES_A_PIECE * (1 if mesh is None else mesh.size) // missions)
+    until, ended, counts = piece - 1, 0, []
+    while ended < missions:
+        flying, count = fly_on(program, env_params, params, flying, np.int32(until))
+        counts.append(count)
+        # A piece is started before the one ahead of it is waited for, so that devices do not wait for the host; after
+        # the last flight a piece does nothing.
+        ended = int(np.sum(counts.pop(0))) if len(counts) > 1 else 0
+        tell(ended, missions)
+        until += piece
+    return end(missions, flying)
 
 
 def fly_on_all_devices(
@@ -127,25 +164,42 @@ def fly_on_all_devices(
     record: bool = False,
     shuffle_codes: bool = False,
     decoder_errors: bool = False,
-    phase: Callable[[str], None] = lambda _: None,
+    phase: ShowPhase | None = None,
 ) -> Flights:
-    """Runs `fly_missions` on all devices and returns the flights on the host; `phase` is called as a phase begins."""
-    phase("compiling")
+    """Runs `fly_missions` on all devices and returns the flights on the host.
+
+    `phase` is called as a phase begins, and as flights end.
+    """
+    if phase is None:
+        tell = None
+    else:
+        phase("compiling")
+        tell = partial(phase, "flying" if _count(env_params) == 1 else "flying the missions")
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     env_params, params = jax.device_put((env_params, params), NamedSharding(mesh, PartitionSpec()))
     key = run_streams(seed).flights
     extras = Extras(record, shuffle_codes, decoder_errors)
-    flights = fly_missions(config, env_params, params, key, actor=actor, extras=extras, mesh=mesh)
-    phase("flying")  # compiled, and not waited for
+    flights = fly_missions(config, env_params, params, key, actor=actor, extras=extras, mesh=mesh, tell=tell)
     return jax.tree.map(np.asarray, flights)
 
 
 def trace_missions(
     config: Config, env_params: EnvParams, params: Any, key: Array, *, record: bool, mesh: Mesh
-) -> jax.stages.Lowered:
-    """Returns the program that `fly_missions` runs for the agent, to be compiled ahead of its first call."""
+) -> list[jax.stages.Lowered]:
+    """Returns the programs that `fly_missions` runs for the agent, to be compiled ahead of its first call."""
     program = _Program(config, AgentActor(config), Extras(record=record))
-    return _compiled_for(mesh).lower(program, mesh, env_params, params, key)
+    begin, fly_on, end = _programs(mesh)
+    first = begin.trace(program, env_params, params, key)
+    flying = jax.tree.map(
+        lambda leaf, layout: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=layout),
+        first.out_info,
+        _layout(mesh, first.out_info),
+    )
+    return [
+        first.lower(),
+        fly_on.lower(program, env_params, params, flying, NO_END),
+        end.lower(_count(env_params), flying),
+    ]
 
 
 def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
@@ -154,40 +208,115 @@ def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
     return jax.vmap(partial(jax.random.fold_in, reset_key))(jnp.arange(missions)), loop_key
 
 
-def _compiled_for(mesh: Mesh | None):
-    return _compiled((jax.devices()[0] if mesh is None else mesh.devices.flat[0]).platform)
-
-
 @functools.cache
-def _compiled(platform: str):
-    # Static by position: a flag passed by name would compile another program.
-    return jax.jit(_fly_all, static_argnums=(0, 1), compiler_options=compiler_options(platform))
+def _programs(mesh: Mesh | None, options: tuple[tuple[str, str | bool], ...] | None = None) -> _Programs:
+    """Returns what flies on the devices of a mesh, compiled with the platform's options, or with others."""
+    platform = (jax.devices()[0] if mesh is None else mesh.devices.flat[0]).platform
+    compiled = partial(jax.jit, compiler_options=compiler_options(platform) if options is None else dict(options))
+    # Static by position: an argument passed by name would compile another program.
+    return _Programs(
+        begin=compiled(partial(_begin_all, mesh), static_argnums=0),
+        fly_on=compiled(partial(_fly_on_all, mesh), static_argnums=0, donate_argnums=3),
+        end=compiled(partial(_end_all, mesh), static_argnums=0),
+    )
 
 
-def _fly_all(program: _Program, mesh: Mesh | None, env_params: EnvParams, params: Any, key: Array) -> Flights:
-    missions = env_params.missions.scene.shape[0]
-    devices = 1 if mesh is None else mesh.size
-    reset_keys, loop_key = flight_keys(key, missions)
-    # Every device flies equally many missions, whole groups; the first ones are repeated to fill up.
-    unit = devices * program.config.env.drones
-    number = jnp.arange(-(-missions // unit) * unit) % missions
-    if program.extras.shuffle_codes and number.shape[0] // devices < 2:
+def _count(env_params: EnvParams) -> int:
+    return env_params.missions.scene.shape[0]
+
+
+def _places(program: _Program, mesh: Mesh | None, missions: int) -> np.ndarray:
+    """Returns numbers [N] of missions: every device flies equally many, whole groups."""
+    unit = (1 if mesh is None else mesh.size) * program.config.env.drones
+    return np.arange(-(-missions // unit) * unit)
+
+
+def _spread(mesh: Mesh | None, function: Callable[..., Any], ins: tuple[Any, ...], outs: Any) -> Callable[..., Any]:
+    """Returns a function of one device's missions as one of all devices'; without a mesh there is one device."""
+    if mesh is None:
+        return function
+    return jax.shard_map(function, mesh=mesh, in_specs=ins, out_specs=outs, check_vma=False)
+
+
+def _axis(mesh: Mesh | None) -> PartitionSpec:
+    return PartitionSpec() if mesh is None else PartitionSpec(*mesh.axis_names)
+
+
+def _specs(mesh: Mesh | None) -> _Flying:
+    """Returns how the leaves of `_Flying` are spread: along their missions."""
+    own: Any = _axis(mesh)
+    by_decision: Any = PartitionSpec(None, *own)
+    return _Flying(own, own, own, own, by_decision, own, own, own)
+
+
+def _layout(mesh: Mesh, flying: _Flying) -> _Flying:
+    """Returns the sharding of each leaf of `flying`, which may be shapes."""
+    specs = jax.tree.broadcast(_specs(mesh), flying, is_leaf=lambda leaf: isinstance(leaf, PartitionSpec))
+    return jax.tree.map(partial(NamedSharding, mesh), specs)
+
+
+def _begin_all(mesh: Mesh | None, program: _Program, env_params: EnvParams, params: Any, key: Array) -> _Flying:
+    """Returns what stands before the reset; the first missions are flown by more than one to fill up the devices."""
+    missions = _count(env_params)
+    places = _places(program, mesh, missions)
+    if program.extras.shuffle_codes and len(places) // (1 if mesh is None else mesh.size) < 2:
         raise ValueError("shuffling codes needs at least two missions on each device")
-    keys = reset_keys[number]
-    fly = partial(_fly, program)
-    if mesh is not None:
-        (axis,) = mesh.axis_names
-        specs = PartitionSpec(), PartitionSpec(), PartitionSpec(axis), PartitionSpec(axis), PartitionSpec()
-        fly = jax.shard_map(fly, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(axis), check_vma=False)
-    flights = fly(env_params, params, number, keys, loop_key)
+    reset_keys, loop_key = flight_keys(key, missions)
+    own, every = _axis(mesh), PartitionSpec()
+    begin = _spread(mesh, partial(_begin, program), (every, every, own, own, every), _specs(mesh))
+    number = jnp.asarray(places % missions)
+    return begin(env_params, params, number, reset_keys[number], loop_key)
+
+
+def _fly_on_all(
+    mesh: Mesh | None, program: _Program, env_params: EnvParams, params: Any, flying: _Flying, until: Array
+) -> tuple[_Flying, Array]:
+    """Flies all devices' missions, each until its own have ended or the decision `until` [] is taken."""
+    missions = _count(env_params)
+    places = _places(program, mesh, missions)
+    own, every, specs = _axis(mesh), PartitionSpec(), _specs(mesh)
+    fly_on = _spread(mesh, partial(_fly_on, program), (every, every, own, own, every, specs), (specs, own))
+    return fly_on(env_params, params, jnp.asarray(places % missions), jnp.asarray(places < missions), until, flying)
+
+
+def _end_all(mesh: Mesh | None, missions: int, flying: _Flying) -> Flights:
+    """Returns the flights of the missions, without those that filled up the devices."""
+    flights = _spread(mesh, _end, (_specs(mesh),), _axis(mesh))(flying)
     return jax.tree.map(lambda leaf: leaf[:missions], flights)
 
 
-def _fly(program: _Program, env_params: EnvParams, params: Any, number: Array, keys: Array, key: Array) -> Flights:
-    """Runs `fly_missions` on one device: missions `number` [M] with the environments' keys [M]."""
+def _begin(program: _Program, env_params: EnvParams, params: Any, number: Array, keys: Array, key: Array) -> _Flying:
+    """Returns what stands before the reset of one device's missions `number` [M] with the environments' keys [M]."""
+    config, missions, task = program.config, number.shape[0], task_of(program.config)
+    action = _action_of(config, program.actor, params)
+    # The first decision resets every environment: the observation and the action before it are not used.
+    state = jax.vmap(partial(task.begin, env_params))(keys, number)
+    actions = jnp.zeros((missions, *action.shape), action.dtype)
+    seen = jax.eval_shape(task.map(partial(task.step, env_params)), state, actions)[1].observation
+    return _Flying(
+        state=state,
+        observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),
+        memory=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (missions, *leaf.shape)), program.actor.init()),
+        flights=jax.vmap(partial(_at_start, config, env_params))(state),
+        record=_blank(config, missions, action) if program.extras.record else None,
+        decoder_errors=jnp.zeros((missions, 2, decoder.BINS), jnp.int32) if program.extras.decoder_errors else None,
+        decision=jnp.full((1,), -1),
+        key=key[None],
+    )
+
+
+def _fly_on(
+    program: _Program,
+    env_params: EnvParams,
+    params: Any,
+    number: Array,
+    is_counted: Array,
+    until: Array,
+    flying: _Flying,
+) -> tuple[_Flying, Array]:
+    """Flies missions `number` [M] of one device on, and counts [1] those that have ended among `is_counted` [M]."""
     config, actor, missions = program.config, program.actor, number.shape[0]
     first, task = actor.init(), task_of(config)
-    action = _action_of(config, actor, params)
     step_all = task.map(partial(task.step, env_params))
 
     def decide(flying: _Flying) -> _Flying:
@@ -213,21 +342,18 @@ def _fly(program: _Program, env_params: EnvParams, params: Any, number: Array, k
             key=key,
         )
 
-    # The first iteration resets every environment: the observation and the action before it are not used.
-    state = jax.vmap(partial(task.begin, env_params))(keys, number)
-    actions = jnp.zeros((missions, *action.shape), action.dtype)
-    seen = jax.eval_shape(step_all, state, actions)[1].observation
-    flying = _Flying(
-        state=state,
-        observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),
-        memory=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (missions, *leaf.shape)), first),
-        flights=jax.vmap(partial(_at_start, config, env_params))(state),
-        record=_blank(config, missions, action) if program.extras.record else None,
-        decoder_errors=jnp.zeros((missions, 2, decoder.BINS), jnp.int32) if program.extras.decoder_errors else None,
-        decision=jnp.full((), -1),
-        key=key,
-    )
-    flying = jax.lax.while_loop(lambda f: jnp.any(f.flights.outcome == Outcome.RUNNING), decide, flying)
+    def goes_on(flying: _Flying) -> Array:
+        return (flying.decision < until) & jnp.any(flying.flights.outcome == Outcome.RUNNING)
+
+    flying = dataclasses.replace(flying, decision=flying.decision[0], key=flying.key[0])
+    flying = jax.lax.while_loop(goes_on, decide, flying)
+    has_ended = flying.flights.outcome != Outcome.RUNNING
+    flying = dataclasses.replace(flying, decision=flying.decision[None], key=flying.key[None])
+    return flying, jnp.sum(has_ended & is_counted)[None]
+
+
+def _end(flying: _Flying) -> Flights:
+    """Returns the flights of one device."""
     whole = None if flying.record is None else _by_mission(flying.record)
     return dataclasses.replace(flying.flights, record=whole, decoder_errors=flying.decoder_errors)
 

@@ -18,6 +18,7 @@ from edqn_jax.evaluation.missions import MissionSet, check_group
 from edqn_jax.evaluation.places import Point, moved_ends, place_world
 from edqn_jax.planning.path import point_text
 from edqn_jax.planning.widest import WidestWay, find_widest_way, is_roomy
+from edqn_jax.policies.unseen import describe_unseen
 from edqn_jax.sim.camera.native import kinds_for_jax
 from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.mjcf import SceneError, check_scene, check_volume, load_world, resolve_world
@@ -171,7 +172,8 @@ def check_world(
     found = dataclasses.replace(found, way=way, nearest=_nearest_shape(scene, way, placed.names or {}))
     if not way.fits:
         return dataclasses.replace(found, refusal=_describe_misfit(found, placed.title))
-    return dataclasses.replace(found, warnings=_warnings(found, placed.title))
+    unseen = describe_unseen(config, config, scene if name not in FAMILIES else None)
+    return dataclasses.replace(found, warnings=(*_warnings(found, placed.title), *unseen))
 
 
 def warn_of_missions(config: Config, missions: MissionSet) -> tuple[str, ...]:

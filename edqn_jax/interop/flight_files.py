@@ -10,6 +10,7 @@ from typing import Any
 from edqn_jax.config import Config
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.evaluate import note_unseen
 from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.places import Point
@@ -85,7 +86,7 @@ def record(
         flights = _write_video(file, policy, config, missions, seed, phase, **film)
     else:
         flights = _write_events(file, policy, config, missions, seed, size, phase)
-    return Recorded(_ending(flights), float(flights.flight_seconds[0]), missions)
+    return Recorded(_ending(flights), float(flights.flight_seconds[0]), note_unseen(policy, config, missions))
 
 
 def _write_video(

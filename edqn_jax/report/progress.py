@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console, Group
@@ -15,6 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from edqn_jax.evaluation.metrics import format_duration
+from edqn_jax.evaluation.rollouts import ShowPhase, show_nothing
 from edqn_jax.learn.learner import learner_metrics
 
 SHOWN = {
@@ -42,19 +43,17 @@ LASTING = ("episodes", "success_rate", "validation_success", "mean_return")
 class Progress:
     """Shows the phases of a run, each with a clock, and the metrics of its training."""
 
-    def __init__(
-        self, console: Console | None = None, every_s: float = 2.0, tell: Callable[[str], None] = lambda _: None
-    ) -> None:
+    def __init__(self, console: Console | None = None, every_s: float = 2.0, tell: ShowPhase = show_nothing) -> None:
         """Writes to `console`, or standard output; without a terminal, a line for each phase and each `every_s`.
 
-        `tell` is called with the name of each phase.
+        `tell` is called with the name of each phase, and with how much of it is done.
         """
         self._tell = tell
         self._console = console or Console()
         self._every_s = every_s
         self._live: Live | None = None
         self._metrics: dict[str, Any] = {}
-        self._phase, self._total = "starting", 0
+        self._phase, self._total, self._counted = "starting", 0, (0, 0)
         self._started = self._phase_started = time.monotonic()
         self._printed = self._started - every_s
         self._updated: tuple[float, int] | None = None  # when, and after how many decisions
@@ -69,7 +68,7 @@ class Progress:
         """Shows that the phase `name` begins; if it is training, with the decisions in all and those taken before."""
         returning = total == 0 and name == "training"  # from a validation
         self._tell(name)
-        self._phase, self._phase_started = name, time.monotonic()
+        self._phase, self._phase_started, self._counted = name, time.monotonic(), (0, 0)
         self._total = total or self._total
         if total:
             self._metrics.setdefault("decisions", done)
@@ -78,6 +77,11 @@ class Progress:
             self._start_live()
         elif not returning:
             self.message(f"[{format_duration(self.elapsed_s)}] {name}")
+
+    def count(self, done: int, total: int) -> None:
+        """Shows how many parts of the phase are done, such as missions that have ended, of how many."""
+        self._counted = done, total
+        self._tell(self._phase, done, total)
 
     def update(self, metrics: Mapping[str, Any]) -> None:
         """Takes in new values: `phase`, `decisions`, any of `SHOWN`, and what else a learner tells."""
@@ -153,13 +157,16 @@ class Progress:
         head.add_column()
         head.add_column(ratio=1)
         head.add_column(justify="right")
-        phase = Text(f"{self._phase} {format_duration(time.monotonic() - self._phase_started)}", style="bold")
+        done, count = self._counted
+        counted = f", {done:,} of {count:,}," if count > 1 else ""
+        clock = format_duration(time.monotonic() - self._phase_started)
+        phase = Text(f"{self._phase}{counted} {clock}", style="bold")
         total = f"{format_duration(self.elapsed_s)} in all"
         if self._total:
             bar = ProgressBar(total=self._total, completed=self._decisions())
-            done = f"{self._decisions():,} / {self._total:,}"
+            taken = f"{self._decisions():,} / {self._total:,}"
             left = f"training left {self._remaining()}" if self._decisions() < self._total else "trained"
-            head.add_row(phase, bar, f"{done}   {left}   {total}")
+            head.add_row(phase, bar, f"{taken}   {left}   {total}")
         else:
             head.add_row(phase, "", total)
         values = Table.grid(expand=True, padding=(0, 1))

@@ -43,6 +43,9 @@ class Display(Protocol):
     def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
         """Shows that the phase `name` begins; if it is training, with the decisions in all and those taken before."""
 
+    def count(self, done: int, total: int) -> None:
+        """Shows how many parts of the phase are done, of how many."""
+
     def update(self, metrics: dict[str, Any]) -> None:
         """Shows the metrics of a chunk."""
 
@@ -51,6 +54,9 @@ class Silent:
     """Shows nothing."""
 
     def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
+        pass
+
+    def count(self, done: int, total: int) -> None:
         pass
 
     def update(self, metrics: dict[str, Any]) -> None:
@@ -107,7 +113,7 @@ class TrainingSetup:
         self._compiled = _in_background(pool, self.trainer.compile, began)
         placed = self._placed(self.missions[0].validation, fresh_policy(self.config), 0)
         flights = rollouts.trace_missions(self.config, *placed, record=True, mesh=self.mesh)
-        self._rollouts_compiled = _in_background(pool, flights.compile, began)
+        self._rollouts_compiled = _in_background(pool, lambda: [each.compile() for each in flights], began)
         self._first: TrainState | None = None
         self.shortest = processes.run_synchronised(self._shortest)
 
@@ -133,7 +139,13 @@ class TrainingSetup:
         self._rollouts_compiled.result()
         placed = self._placed(missions, params, agent)
         recorded = rollouts.Extras(record=True)
-        return processes.fetch_global(rollouts.fly_missions(self.config, *placed, extras=recorded, mesh=self.mesh))
+
+        def tell(ended: int, count: int) -> None:  # the agents fly one after the other
+            self.display.count(agent * count + ended, len(self.configs) * count)
+
+        return processes.fetch_global(
+            rollouts.fly_missions(self.config, *placed, extras=recorded, mesh=self.mesh, tell=tell)
+        )
 
     def _shortest(self) -> ShortestPath:
         scene = self.missions[0].scene

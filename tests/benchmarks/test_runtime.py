@@ -229,19 +229,21 @@ def test_what_has_been_measured_is_on_the_disk_after_each_seed(
 
 
 def test_quick_is_of_the_papers_world_unless_told_otherwise() -> None:
-    assert list(runtime.parse(["--quick"]).configs) == ["paper"]
+    quick = runtime.parse(["--quick"])
+    assert list(quick.configs) == ["paper"] and quick.words.seeds == 1
+    # Both learn it: what is shown of them is what they fly.
+    assert quick.configs["paper"].train.total_steps == runtime.parse([]).configs["paper"].train.total_steps
+    assert quick.words.methods == ["E-DQN", "DQN blind", *PLANNERS] and len(runtime.parse([]).words.methods) > 10
     assert runtime.parse(["--seeds", "0"]).words.worlds == ["paper", "medium"]
     assert runtime.parse(["--quick", "--seeds", "0", "--worlds", "dense"]).words.worlds == ["dense"]
 
 
-def test_quick_rows_are_marked_as_not_converged(
-    faked: type[Fake], clear: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_quick_rows_are_marked(faked: type[Fake], clear: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert runtime.main(["--quick", "--worlds", str(clear), "--methods", "E-DQN", "A*", "Conventional stack"]) == 0
     shown, told = capsys.readouterr()
-    assert "240,000 decisions to train" in told
-    assert "| E-DQN (not converged) |" in shown and "| A* |" in shown
-    assert "| Conventional stack (not converged) | no | 40.0 (1,000) |" in shown
+    assert "1,000,000 decisions to train" in told
+    assert "| E-DQN (quick) |" in shown and "| A* |" in shown
+    assert "| Conventional stack (quick) | no | 40.0 (1,000) |" in shown
 
 
 def test_where_there_is_no_way_learners_are_not_trained(

@@ -57,6 +57,10 @@ def test_a_line_names_phase_clock_and_what_is_left() -> None:
     assert status.line(began + 80.0) == "edqn record: drawing, 20 of 80, 0:20, about 1:00 left, 1:20 in all"
     status.phase("drawing", 80, 80)
     assert "left" not in status.line(began + 90.0)
+    # Of flights that are flown at once most end late: nothing is known of the time that is left.
+    status.phase("flying the missions", 3, 300)
+    status._phase_began = began + 90.0
+    assert status.line(began + 95.0) == "edqn record: flying the missions, 3 of 300, 0:05, 1:35 in all"
 
 
 def test_a_terminal_sees_a_line_before_anything_is_imported_that_makes_way_and_is_gone_at_the_end() -> None:

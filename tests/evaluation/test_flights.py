@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -155,6 +156,24 @@ def test_shuffling_moves_the_codes_and_nothing_else(course):
     assert np.mean(kept[both] != moved[both]) > 0.2  # most views differ, but moves are few
 
 
+def test_the_ends_of_flights_are_told_as_they_fly_and_change_no_flight(course, monkeypatch):
+    count = MISSIONS - 1  # a mission is flown twice to fill up the devices
+    world = dataclasses.replace(
+        course.env_params, missions=jax.tree.map(lambda leaf: leaf[:count], course.env_params.missions)
+    )
+    told: list[tuple[Any, ...]] = []
+    whole = fly_on_all_devices(CONFIG, world, always((1, 0, 0)), record=True)
+    monkeypatch.setattr(rollouts, "DRONES_A_PIECE", MISSIONS)
+    pieces = fly_on_all_devices(CONFIG, world, always((1, 0, 0)), record=True, phase=lambda *words: told.append(words))
+    for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(pieces), strict=True):
+        assert np.array_equal(one, other, equal_nan=True) and len(one) == count
+    assert told[:2] == [("compiling",), ("flying the missions", 0, count)]
+    ended = [done for name, done, total in told[1:] if (name, total) == ("flying the missions", count)]
+    assert len(ended) == len(told) - 1 and ended == sorted(ended) and ended[-1] == count and len(set(ended)) > 3
+    # Each of 2 devices flies 2 or 3 decisions a piece; the count is one piece late.
+    assert len(ended) <= whole.decisions.max() // 2 + 3
+
+
 def test_one_mission_has_nobody_to_shuffle_with(course):
     world = course.env_params
     alone = dataclasses.replace(world, missions=jax.tree.map(lambda leaf: leaf[:1], world.missions))
@@ -167,7 +186,8 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     layout = NamedSharding(mesh, PartitionSpec())
     world, params = jax.device_put((course.env_params, always((1, 0, 0))), layout)
     key = jax.random.key(0)
-    rollouts.trace_missions(CONFIG, world, params, key, record=True, mesh=mesh).compile()
+    for program in rollouts.trace_missions(CONFIG, world, params, key, record=True, mesh=mesh):
+        program.compile()
     another_key = jax.random.key(1)
     compiled: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event))

@@ -34,6 +34,7 @@ from edqn_jax.fly.simulated.lockstep import SimulatedClock  # noqa: E402
 from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_mission  # noqa: E402
 from edqn_jax.fly.simulated.several import fly_at_once  # noqa: E402
 from edqn_jax.fly.streams import EVENT, DvStream  # noqa: E402
+from edqn_jax.interop.deployment import onnx_export  # noqa: E402
 from edqn_jax.interop.deployment.onnx_export import export_policy  # noqa: E402
 from edqn_jax.runs.policies import load_policy  # noqa: E402
 from tests.support.interop.ports import free_port  # noqa: E402
@@ -277,6 +278,25 @@ def test_bad_input_is_one_sentence(
     assert main(["fly", *words]) == 2
     said = capsys.readouterr().err
     assert says in said and said.count("\n") == 1
+
+
+def test_a_world_larger_than_those_of_training_is_warned_of_before_it_flies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ends(*_: object) -> None:
+        raise ConfigError("exported")
+
+    world = tmp_path / "wide.xml"
+    world.write_text(
+        '<mujoco><worldbody><site name="start" pos="3 10 3"/><site name="goal" pos="37 10 4"/>'
+        '<site name="volume" type="box" pos="250 10 6" size="250 10 6"/><geom type="plane" size="0 0 1"/>'
+        "</worldbody></mujoco>"
+    )
+    monkeypatch.setattr(onnx_export, "export_policy", ends)
+    assert main(["fly", "pretrained", "--simulate", str(world)]) == 2
+    assert "the flight volume of 500 × 20 × 12 m is much larger than those" in capsys.readouterr().out
+    assert main(["fly", "pretrained", "--simulate", "medium"]) == 2
+    assert capsys.readouterr().out == ""
 
 
 @pytest.mark.parametrize(

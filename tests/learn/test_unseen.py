@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from edqn_jax.config.loading import make_config
 from edqn_jax.policies.unseen import describe_unseen
+from edqn_jax.sim.scene.mjcf import load_scene
+from edqn_jax.sim.scene.surface import SURFACE_NUMBERS
 
 TRAINED = make_config("medium", surface={"pattern": "plaid"})
 MANY = make_config("medium", surface={"pattern": "drawn"})
@@ -35,3 +39,15 @@ def test_each_difference_that_matters_is_a_sentence_and_nothing_else_is(trained,
         trained, make_config("medium", **{"surface": {"pattern": trained.surface.pattern}, **options})
     )
     assert len(found) == len(says) and all(each in line for each, line in zip(says, found, strict=True))
+
+
+def test_a_world_with_patterns_of_its_own_is_unseen_by_a_policy_of_one_look(tmp_path: Path) -> None:
+    stripes = "3 0.5 1 0 0 0.5 " + "0 " * (SURFACE_NUMBERS - 6)
+    body = '<worldbody><geom name="it" type="box" size="1 1 1"/></worldbody>'
+    plain, striped = tmp_path / "plain.xml", tmp_path / "striped.xml"
+    plain.write_text(f"<mujoco>{body}</mujoco>")
+    striped.write_text(f'<mujoco>{body}<custom><numeric name="surface:it" data="{stripes}"/></custom></mujoco>')
+    assert describe_unseen(TRAINED, TRAINED, load_scene(plain)) == []
+    (line,) = describe_unseen(TRAINED, TRAINED, load_scene(striped))
+    assert "trained with surface.pattern plaid alone; the shapes of this world have patterns of their own" in line
+    assert describe_unseen(MANY, MANY, load_scene(striped)) == []

@@ -41,6 +41,26 @@ def test_a_terminal_shows_the_last_values_and_keeps_messages():
     assert "300 / 1,000" in out and "25.0%" in out and "flown: [goal]" in out and "in all" in out
 
 
+def test_missions_are_counted_while_they_fly_and_only_then():
+    told: list[tuple[object, ...]] = []
+    console = Console(file=io.StringIO(), force_terminal=True, width=120)
+    progress = Progress(console, tell=lambda *words: told.append(words))
+
+    def seen() -> str:
+        with console.capture() as panel:
+            console.print(progress._panel())
+        return panel.get()
+
+    progress.phase("training", total=1000)
+    progress.phase("validating")
+    progress.count(1, 300)
+    assert "validating, 1 of 300, 0:00" in seen()
+    progress.phase("training")
+    assert "300" not in seen()
+    progress.stop()
+    assert told == [("training",), ("validating",), ("validating", 1, 300), ("training",)]
+
+
 def test_a_loss_that_a_chunk_does_not_have_is_not_shown_again():
     out = io.StringIO()
     progress = Progress(Console(file=out), every_s=0.0)

@@ -15,7 +15,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -89,7 +88,7 @@ if __name__ == "__main__":
         del argv[0]
         Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self: None, no_learning
         Trainer.trace = lambda self: None
-        rollouts.trace_missions = lambda *_, **__: SimpleNamespace(compile=lambda: None)
+        rollouts.trace_missions = lambda *_, **__: []
     code = main(["train", *argv])
     Path(note).write_text(json.dumps(to_plain_json(noted)), encoding="utf-8")
     sys.exit(code)

@@ -22,6 +22,10 @@ TICK_S = 0.25
 SILENT_S = 10.0
 """Longest time without a line elsewhere."""
 
+UNEVEN = ("flying the missions", "validating")
+"""Phases whose parts end late and together, as flights do that are flown at once: how many are done says little of
+the time that is left, and no such time is shown."""
+
 _CLEARED = b"\r\x1b[K"
 
 
@@ -75,7 +79,7 @@ class Status:
         if self._total:
             parts.append(f"{self._done:,} of {self._total:,}")
         parts.append(_clock(took))
-        if 0 < self._done < self._total:
+        if 0 < self._done < self._total and self._name not in UNEVEN:
             parts.append(f"about {_clock(took / self._done * (self._total - self._done))} left")
         if now - self._began > took + 1.0:
             parts.append(f"{_clock(now - self._began)} in all")

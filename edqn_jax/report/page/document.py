@@ -12,6 +12,7 @@ from typing import Any
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.metrics import clearance_text, summarise_flights
+from edqn_jax.evaluation.rollouts import ShowPhase
 from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies import function_named
@@ -53,13 +54,19 @@ def write_report(policies: Shown | Sequence[Shown], file: str | Path, *, mission
     write_atomically(Path(file), build_report(shown, missions).encode())
 
 
-def build_report(shown: Sequence[Shown], most: int, message: Callable[[str], None] = lambda _: None) -> str:
+def build_report(
+    shown: Sequence[Shown],
+    most: int,
+    message: Callable[[str], None] = lambda _: None,
+    phase: ShowPhase | None = None,
+) -> str:
     """Returns the page of runs and policies, their evaluation missions flown anew, those of folders first.
 
     Args:
         shown: folders of several seeds stand for each seed's.
         most: flights of a run at most.
         message: told of what takes time.
+        phase: called as a phase of flying begins, and as flights end.
 
     Raises:
         ConfigError: if a folder holds no run, or the runs are too many for one page.
@@ -72,8 +79,8 @@ def build_report(shown: Sequence[Shown], most: int, message: Callable[[str], Non
     if count > MAX_FLIGHTS:
         raise ConfigError(f"{count} runs are too many for one page; give at most {MAX_FLIGHTS}")
     most = min(most, MAX_FLIGHTS // count)
-    runs = [fly_run(folder, name, most, message) for folder, name in zip(single, names_of(single), strict=True)]
-    runs += [fly_policy(as_policy(policy), name, most, message) for name, policy in policies]
+    runs = [fly_run(folder, name, most, message, phase) for folder, name in zip(single, names_of(single), strict=True)]
+    runs += [fly_policy(as_policy(policy), name, most, message, phase) for name, policy in policies]
     data = page_data(runs)
     left = MAX_BYTES - len(build_html(runs, data).encode()) - 100_000
     if left < 0:

@@ -13,7 +13,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import MissionSet, final_missions
-from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.evaluation.rollouts import ShowPhase, fly_on_all_devices
 from edqn_jax.learn.actor import Actor, AgentActor, PolicyParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies import policy_folder
@@ -58,7 +58,13 @@ def folders_of(run: Path) -> list[Path]:
     return sorted(seeds, key=lambda folder: int(folder.name.removeprefix(SEED_FOLDER))) or [run]
 
 
-def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] = lambda _: None) -> EvaluatedRun:
+def fly_run(
+    folder: Path,
+    name: str,
+    most: int,
+    message: Callable[[str], None] = lambda _: None,
+    phase: ShowPhase | None = None,
+) -> EvaluatedRun:
     """Reads a run and flies its evaluation missions anew, as at its end.
 
     Args:
@@ -66,6 +72,7 @@ def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] =
         name: what the page calls it.
         most: missions at most.
         message: told of what takes time.
+        phase: called as a phase of it begins, and as flights end.
 
     Raises:
         ConfigError: if there is no run, its policy cannot be loaded, or a file of it is not as a run writes it.
@@ -81,7 +88,7 @@ def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] =
             raise ValueError("something other than an object in a file of JSON")
     except (AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         raise ConfigError(f"a file of the run in '{folder}' is not as a run writes it: {error}"[:300]) from None
-    missions, flights = _evaluate(config, params, AgentActor(config), most, f"'{folder}'", message)
+    missions, flights = _evaluate(config, params, AgentActor(config), most, f"'{folder}'", message, phase)
     count, notes = len(flights.outcome), worlds_replaced(folder)
     if count < config.train.validation_missions:
         notes.append(f"{count} of the run's {config.train.validation_missions} evaluation flights are on this page.")
@@ -95,7 +102,11 @@ def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] =
 
 
 def fly_policy(
-    policy: Policy | FunctionPolicy, name: str, most: int, message: Callable[[str], None] = lambda _: None
+    policy: Policy | FunctionPolicy,
+    name: str,
+    most: int,
+    message: Callable[[str], None] = lambda _: None,
+    phase: ShowPhase | None = None,
 ) -> EvaluatedRun:
     """Flies a policy that no folder holds on the missions that a run of its configuration ends with.
 
@@ -103,24 +114,32 @@ def fly_policy(
         policy: as `as_policy` returns it.
         name: what the page calls it.
         most: missions at most.
-        message: told of what takes time.
+        message, phase: as in `fly_run`.
 
     Raises:
         ConfigError: if it cannot fly there.
     """
     config = config_of(policy)
-    missions, flights = _evaluate(config, policy.params, actor_of(policy, config), most, f"'{name}'", message)
+    missions, flights = _evaluate(config, policy.params, actor_of(policy, config), most, f"'{name}'", message, phase)
     return EvaluatedRun(name, config, config_text(config), policy.params, missions, flights, {}, [], {}, [])
 
 
 def _evaluate(
-    config: Config, params: PolicyParams | None, actor: Actor, most: int, name: str, message: Callable[[str], None]
+    config: Config,
+    params: PolicyParams | None,
+    actor: Actor,
+    most: int,
+    name: str,
+    message: Callable[[str], None],
+    phase: ShowPhase | None,
 ) -> tuple[MissionSet, Flights]:
     missions = final_missions(config, most)
     count = missions.env_params.missions.scene.shape[0]
     message(f"flying {count} mission{'' if count == 1 else 's'} of {name}")
-    seed = config.train.seed
-    return missions, fly_on_all_devices(config, missions.env_params, params, seed, actor=actor, record=True)
+    flights = fly_on_all_devices(
+        config, missions.env_params, params, config.train.seed, actor=actor, record=True, phase=phase
+    )
+    return missions, flights
 
 
 def names_of(folders: Sequence[Path]) -> list[str]:

@@ -21,7 +21,7 @@ from edqn_jax.devices.hardware import describe_processor
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.metrics import flight_summary
 from edqn_jax.evaluation.missions import RunMissions, missions_of_runs
-from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.evaluation.rollouts import ShowPhase, fly_on_all_devices
 from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.evaluation.verdicts import check_verdicts, judges_of
 from edqn_jax.learn import saved_state
@@ -64,25 +64,28 @@ class Finding:
     """None where there is nothing left to compare."""
 
 
-def verify_run(folder: Path, message: Callable[[str], None] = lambda _: None) -> list[Finding]:
+def verify_run(
+    folder: Path, message: Callable[[str], None] = lambda _: None, phase: ShowPhase | None = None
+) -> list[Finding]:
     """Verifies a finished run, or those of all seeds that were trained together.
 
     Args:
         folder: of the run.
         message: told of what takes time.
+        phase: called as a phase of flying begins, and as flights end.
 
     Raises:
         ConfigError: if there is no finished run, or a file of it is not as a run writes it.
     """
     try:
-        return _verified(folder, message)
+        return _verified(folder, message, phase)
     except ConfigError:
         raise
     except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         raise ConfigError(f"a file of the run in '{folder}' is not as a run writes it: {error!r}"[:300]) from None
 
 
-def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
+def _verified(folder: Path, message: Callable[[str], None], phase: ShowPhase | None) -> list[Finding]:
     found = find_run(folder)
     if found is None:
         raise no_run(folder)
@@ -105,7 +108,8 @@ def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
     for number, (each, summary, of_run) in enumerate(zip(runs, summaries, missions, strict=True)):
         config, params = policies[number]
         message(f"flying {of_run.final.env_params.missions.scene.shape[0]} missions of '{each.path}' again")
-        flights = fly_on_all_devices(config, of_run.final.env_params, params, config.train.seed, record=True)
+        world, seed = of_run.final.env_params, config.train.seed
+        flights = fly_on_all_devices(config, world, params, seed, record=True, phase=phase)
         agent = None if checkpoint is None else _Saved.of(checkpoint, number)
         name = "" if found.seeds is None else f"{each.path.name}: "
         findings += [
