@@ -11,7 +11,7 @@ The methods take turns, seed by seed, so that a change in the machine's speed af
 
 Arguments after -- are options of train.py for the learners. The full run, five seeds on both worlds, takes about three
 and a quarter hours on two cores: one for the paper's world, the rest for medium worlds. All methods of a world are kept
-in memory, about 15 GB. --quick takes less than ten minutes; its default is the paper's world alone.
+in memory, about 15 GB. --quick is one seed of E-DQN and the blind agent on the paper's world, beside all planners.
 """
 
 from __future__ import annotations
@@ -51,17 +51,18 @@ from rivals.stack import STACK, STEADY
 ROOT = Path(__file__).resolve().parents[1]
 WORLDS, QUICK_WORLDS = ("paper", "medium"), ("paper",)
 METHODS = (*LEARNERS, *PLANNERS, STACK)
-SEEDS, QUICK_SEEDS = 5, 2
+QUICK_METHODS = ("E-DQN", "DQN blind", *PLANNERS)
+SEEDS, QUICK_SEEDS = 5, 1
 POINTS = 20
 """Number of validations in a training, the points of the learning curve, unless --train.validation-every is given."""
 BUDGET_SECONDS, QUICK_BUDGET_SECONDS = 5.0, 1.0
 PLANNED, QUICK_PLANNED = 32, 4
 """Number of missions for planners in random worlds, the first of the test missions of learners."""
 QUICK = (
-    *("--total-steps", "60000", "--train.validation-missions", "32", "--train.validation-every", "15000"),
+    *("--total-steps", "500000", "--train.validation-missions", "32", "--train.validation-every", "50000"),
     *("--world.pool-size", "128", "--world.missions", "1024"),
 )
-"""Options for `--quick`: long enough to run every part, too short to learn, with fewer worlds to generate."""
+"""Options for `--quick`: enough decisions to learn the paper's world, fewer validations and worlds to generate."""
 
 TURNS, QUICK_TURNS = 5, 1
 """Turns of the training rates."""
@@ -92,14 +93,13 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     words, flags = split(argv)
     parser = Parser("runtime", __doc__)
     parser.add_argument(
-        "--quick", action="store_true", help="60 000 decisions, two seeds, the paper's world: learners do not converge"
+        "--quick", action="store_true", help="E-DQN, the blind agent and all planners on the paper's world, one seed"
     )
     parser.add_argument(
         "--methods",
         nargs="+",
-        default=list(METHODS),
         metavar="NAME",
-        help=f"methods to run (default: all): {', '.join(METHODS)}",
+        help=f"methods to run (default: all, quick without the other learners): {', '.join(METHODS)}",
     )
     parser.add_argument(
         "--worlds", nargs="+", metavar="WORLD", help="--world of train.py (default paper and medium, quick paper)"
@@ -117,6 +117,8 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     )
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="write a picture of the rows to this file")
     args = parser.parse(words)
+    if args.methods is None:
+        args.methods = list(QUICK_METHODS if args.quick else METHODS)
     if args.worlds is None:
         args.worlds = list(QUICK_WORLDS if args.quick else WORLDS)
     if args.seeds is None:

@@ -58,7 +58,7 @@ def _name(world: str) -> str:
 
 def _caption(rows: Sequence[Row]) -> str:
     devices = ", ".join(dict.fromkeys(row["device"] for row in rows if row["device"]))
-    quick = "; too short to converge" if any(row["settings"].get("quick") for row in rows) else ""
+    quick = "; quick" if any(row["settings"].get("quick") for row in rows) else ""
     return (
         f"{devices}{quick}. Blue: learners, without a map. Orange: planners, with the map. "
         "Planning: computation alone; medians of flights that arrived. Bars: 95 % intervals.\n"

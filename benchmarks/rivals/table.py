@@ -78,7 +78,7 @@ def methods(rows: Sequence[Row]) -> str:
         shown = figures(row)
         name = row["name"]
         if row["kind"] == "learner" and row["settings"].get("quick"):
-            name += " (not converged)"
+            name += " (quick)"
         elif name in IMPROVING:
             name += f", {row['settings']['budget_seconds']:g} s"
         if row["reason"] is not None:
