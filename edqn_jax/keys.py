@@ -1,7 +1,10 @@
-"""Random keys by purpose, and integers from few random bits."""
+"""Random keys by purpose, and numbers that are drawn in several places."""
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -59,6 +62,16 @@ def uniform_integers(key: Array, shape: tuple[int, ...], below: int | Array) -> 
     """
     bits = jax.random.bits(key, shape, jnp.uint32)
     return (bits % jnp.asarray(below, jnp.uint32)).astype(jnp.int32)
+
+
+def log_uniform(key: Array, least: float, most: float) -> Array:
+    """Returns a number [] between both, its logarithm uniform; `key` is consumed."""
+    return jnp.exp(jax.random.uniform(key, minval=math.log(least), maxval=math.log(most)))
+
+
+def uniform_parts(key: Array, counts: Sequence[int]) -> list[Array]:
+    """Returns as many uniform numbers in [0, 1) as each of the counts says, of one draw; `key` is consumed."""
+    return jnp.split(jax.random.uniform(key, (sum(counts),)), list(itertools.accumulate(counts))[:-1])
 
 
 def split_each(keys: Array, count: int) -> Array:

@@ -12,16 +12,12 @@ registers the two names; JAX is configured by whoever imports it (`edqn_jax.use_
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypedDict, Unpack
+from typing import Any, ClassVar, Unpack
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 from numpy.typing import NDArray
 
 from edqn_jax.config import Config
@@ -29,26 +25,16 @@ from edqn_jax.devices.forks import check_not_forked, lacks_threads
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require_extra
-from edqn_jax.interop import functional
 from edqn_jax.interop.drone_programs import (
     Drone,
-    Leaves,
-    Program,
     reset_many,
     reset_one,
     reset_some,
     step_many,
     step_one,
 )
-from edqn_jax.interop.functional import FunctionalEnv, Kind, Params
-from edqn_jax.learn.perception.code import Params as EncoderParams
-from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.actions import Box, Discrete
-from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.task.action_sets import are_actions, describe_space
-from edqn_jax.sim.task.env import EnvState
+from edqn_jax.interop.gym_task import TaskOptions, make_task, on_host
 from edqn_jax.sim.task.outcomes import Outcome
-from edqn_jax.sim.task.reward import Reward
 
 gymnasium = require_extra("gymnasium", extra="gym")
 
@@ -57,113 +43,6 @@ SEEDS = 2**32
 
 RESET_TOGETHER = 16
 """Drones that one call of the program resets in the step in which they ended; more of them take several calls."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Task:
-    """What one environment and many have in common."""
-
-    env: FunctionalEnv
-    params: Params
-    limit: int | None = None
-
-    @property
-    def config(self) -> Config:
-        return self.env.config
-
-    @property
-    def environment(self) -> Environment:
-        return Environment(self.config, self.params.world)
-
-    @functools.cached_property
-    def program(self) -> tuple[Program, Leaves, EncoderParams]:
-        """Returns the first arguments of every compiled function."""
-        leaves, structure = jax.tree.flatten(self.params.world)
-        return Program(self.env, structure, self.limit), leaves, self.params.encoder
-
-    @property
-    def observations(self) -> Any:
-        """Returns the space of one drone's observations."""
-        space = self.env.observation_space(self.params)
-        if isinstance(space, Box):
-            return _box(space)
-        return gymnasium.spaces.Dict({name: _box(box) for name, box in space.items()})
-
-    @property
-    def actions(self) -> Any:
-        """Returns the space of one drone's actions."""
-        space = self.env.action_space(self.params)
-        return gymnasium.spaces.Discrete(space.n) if isinstance(space, Discrete) else _box(space)
-
-    def action(self, given: Any, count: int | None) -> NDArray:
-        """Returns actions [count, ...], or one, as the programs take them.
-
-        Raises:
-            gymnasium.error.InvalidAction: if they are none.
-        """
-        space, numbers = self.env.action_space(self.params), np.asarray(given)
-        if not are_actions(space, numbers, () if count is None else (count,)):
-            wanted = "an action must be" if count is None else f"there must be {count} actions, each"
-            raise gymnasium.error.InvalidAction(f"{wanted} {describe_space(space)}")
-        return numbers.astype(space.dtype)
-
-    def mission(self, options: dict[str, Any] | None, count: int | None) -> Array | None:
-        """Returns which missions [count], or [] of one drone, the options of a reset ask for; None draws them.
-
-        Raises:
-            ConfigError: names the options that there are.
-        """
-        if not options:
-            return None
-        if set(options) != {"mission"}:
-            raise ConfigError(f"options of reset may have 'mission' alone, not {', '.join(map(repr, options))}")
-        asked, most = np.asarray(options["mission"]), self.environment.missions
-        if not np.issubdtype(asked.dtype, np.integer) or np.any(asked < 0) or np.any(asked >= most):
-            raise ConfigError(f"mission must be whole numbers from 0 to {most - 1}, not {options['mission']}")
-        if asked.shape not in ((), () if count is None else (count,)):
-            raise ConfigError(f"mission must be one number{'' if count is None else f' or {count}'}, not {asked.size}")
-        return jnp.asarray(np.broadcast_to(asked, () if count is None else (count,)), jnp.int32)
-
-    def picture(self, state: EnvState) -> NDArray[np.uint8]:
-        """Returns what a person would see from a drone's camera, [192, 256, 3] with the default camera."""
-        return np.round(np.asarray(self.environment.picture(state)) * 255.0).astype(np.uint8)
-
-
-def _on_host(tree: Any) -> Any:
-    """Returns the arrays as NumPy's own, which may be written: JAX's may not."""
-    return jax.tree.map(np.array, tree)
-
-
-def _box(space: Box) -> Any:
-    return gymnasium.spaces.Box(space.low, space.high, space.shape, np.float32)
-
-
-class TaskOptions(TypedDict, total=False):
-    """Options of `DroneEnv` and `DroneVectorEnv`, as keywords."""
-
-    observation: Kind
-    """`image` (default) is a Dict of `image`, `own` [10] and `motion` [7]: the image holds the signed number of events
-    of each pixel as a logarithm, [H, W], or what another sensor of the configuration shows. `code` is one vector of
-    code, own state and own motion. `kinematics` is own state and motion, without a sensor."""
-    policy: Policy | None
-    """Whose encoder makes the codes."""
-    worlds: int | None
-    """Random worlds, of which each reset draws one; None is `functional.WORLDS`, and 1 for a world from a file."""
-    world_seed: int
-    """Which random worlds, of those that training draws from."""
-    reward: Reward | None
-    """Of every decision, in place of the configured one: a function of a `Transition`."""
-
-
-def _task(
-    world: str | Path | None, config: Config | None, limit: int | None = None, **options: Unpack[TaskOptions]
-) -> _Task:
-    """Returns the task of these arguments, which are those of `DroneEnv`.
-
-    Raises:
-        ConfigError: if they do not fit each other, or the world cannot be flown.
-    """
-    return _Task(*functional.make(world, config, **options), limit)
 
 
 class DroneEnv(gymnasium.Env):
@@ -199,7 +78,7 @@ class DroneEnv(gymnasium.Env):
             # AsyncVectorEnv hands on what reset raises in a process, and not what making raises there.
             self.observation_space, self.action_space = DroneEnv.spaces_before
             return
-        self.task = _task(world, config, **options)
+        self.task = make_task(world, config, **options)
         self.observation_space = self.task.observations
         self.action_space = self.task.actions
         DroneEnv.spaces_before = self.observation_space, self.action_space
@@ -223,7 +102,7 @@ class DroneEnv(gymnasium.Env):
         super().reset(seed=seed)
         number = self.np_random.integers(SEEDS) if seed is None else seed % SEEDS
         self.drone, observed = reset_one(*self.task.program, np.uint32(number), mission)
-        return _on_host(observed), {}
+        return on_host(observed), {}
 
     @as_tested
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -244,7 +123,7 @@ class DroneEnv(gymnasium.Env):
         if self.drone is None or self.drone.state.ended:
             raise gymnasium.error.ResetNeeded("there is no episode to step in; call reset first")
         self.drone, decided = step_one(*self.task.program, self.drone, self.task.action(action, None))
-        decided = _on_host(decided)
+        decided = on_host(decided)
         outcome = Outcome(int(decided.outcome))
         info = {"outcome": outcome.name.lower(), "is_success": outcome is Outcome.GOAL}
         return decided.observed, float(decided.reward), bool(decided.terminated), bool(decided.truncated), info
@@ -303,7 +182,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         _check_render_mode(render_mode)
         limit = _limit(max_episode_steps)
         self.metadata = {**self.metadata, "autoreset_mode": _autoreset_mode(autoreset_mode)}
-        self.task = _task(world, config, limit, **options)
+        self.task = make_task(world, config, limit, **options)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.single_observation_space = self.task.observations
@@ -336,7 +215,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             super().reset(seed=each[0])
         numbers = self.np_random.integers(SEEDS, size=self.num_envs) if each is None else [one % SEEDS for one in each]
         self.drones, observed = reset_many(*self.task.program, np.asarray(numbers, np.uint32), missions)
-        return _on_host(observed), {}
+        return on_host(observed), {}
 
     def _each(self, seed: int | Sequence[int] | None) -> list[int] | None:
         """Returns the seed of each drone; None where they go on from the ones before.
@@ -376,7 +255,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             raise gymnasium.error.ResetNeeded("there are no episodes to step in; call reset first")
         chosen = self.task.action(actions, self.num_envs)
         self.drones, decided = step_many(*self.task.program, self.drones, chosen)
-        decided = _on_host(decided)
+        decided = on_host(decided)
         ended = decided.terminated | decided.truncated
         info: dict[str, Any] = {}
         if ended.any():

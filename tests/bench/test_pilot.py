@@ -159,29 +159,19 @@ def test_the_command_never_exceeds_the_limit_and_a_flight_that_is_over_stays_so(
 
 
 MOVING = """<mujoco>
-  <custom><text name="motion:it" data="bounce {velocity}"/></custom>
+  <custom><text name="motion:it" data="{motion}"/></custom>
   <worldbody>
     <site name="start" pos="3 10 4"/><site name="goal" pos="21 10 4"/>
     <site name="volume" type="box" pos="12 10 4" size="12 10 4"/>
-    <body name="it" mocap="true" pos="{place}"><geom type="box" size="{size}"/></body>
+    <body name="it" mocap="true" pos="{place}"><geom type="{kind}" size="{size}"/></body>
   </worldbody>
 </mujoco>"""
 
 
-BALL = """<mujoco>
-  <custom><text name="motion:it" data="throw 0.6 2 6 10 0 0 4"/></custom>
-  <worldbody>
-    <site name="start" pos="3 10 4"/><site name="goal" pos="21 10 4"/>
-    <site name="volume" type="box" pos="12 10 4" size="12 10 4"/>
-    <body name="it" mocap="true" pos="12 2 2"><geom type="sphere" size="0.4"/></body>
-  </worldbody>
-</mujoco>"""
-
-
-def hovering(tmp_path: Path, decisions: int, world: str = MOVING, **words: str) -> list[Piloted]:
+def hovering(tmp_path: Path, decisions: int, motion: str, place: str, size: str, kind: str = "box") -> list[Piloted]:
     """A drone that stays at its start while something moves in front of it; it after 0, 1, ... decisions."""
     file = tmp_path / "moving.xml"
-    file.write_text(world.format(**words))
+    file.write_text(MOVING.format(motion=motion, place=place, kind=kind, size=size))
     pool = stack_scenes([load_world(file).scene])
     flown = EnvParams(load_airframe(CONFIG.drone), pool, own_missions(pool))
     number, shape = jnp.zeros((), jnp.int32), pilot.grid_shape(TRUE.map, pool.volume)
@@ -197,7 +187,7 @@ def hovering(tmp_path: Path, decisions: int, world: str = MOVING, **words: str) 
 def test_what_an_obstacle_has_left_becomes_free_again(tmp_path: Path) -> None:
     # Its face is 4 m ahead at x = 7, and its middle moves from y = 8 to y = 14 in 3 s; without images of the world at
     # their own times it would stay where it is drawn.
-    seen = hovering(tmp_path, 26, place="8 8 4", size="1 1 4", velocity="0 2 0  8 8 4  8 14 4")
+    seen = hovering(tmp_path, 26, "bounce 0 2 0  8 8 4  8 14 4", place="8 8 4", size="1 1 4")
     cell = lambda y: (14, int(2 * y), 8)  # noqa: E731
     first, hit = np.asarray(seen[0].grid.log_odds), TRUE.map.hit
     assert first[cell(8.25)] == pytest.approx(hit) and first[cell(12.25)] < 0
@@ -211,7 +201,7 @@ def test_what_an_obstacle_has_left_becomes_free_again(tmp_path: Path) -> None:
 
 def test_an_obstacle_that_flies_into_a_hovering_drone_is_a_collision_at_its_own_time(tmp_path: Path) -> None:
     # Its face is 3 m from the drone's middle and comes at 2 m/s: it touches the body 1.32 s after the start.
-    seen = hovering(tmp_path, 7, place="7 10 4", size="1 1 1", velocity="-2 0 0  2 10 4  7 10 4")
+    seen = hovering(tmp_path, 7, "bounce -2 0 0  2 10 4  7 10 4", place="7 10 4", size="1 1 1")
     end = seen[-1].flights
     assert int(end.outcome) == Outcome.COLLISION and int(end.decisions) == 6
     assert float(end.flight_seconds) == pytest.approx((3 - CONFIG.drone.body_radius_m) / 2, abs=0.01)
@@ -219,14 +209,14 @@ def test_an_obstacle_that_flies_into_a_hovering_drone_is_a_collision_at_its_own_
 
 def test_a_ball_is_thrown_at_where_the_pilot_hovers(tmp_path: Path) -> None:
     # Due 0.7 s after the start, so thrown as the third decision begins, 2 s before it would meet the drone's middle.
-    end = hovering(tmp_path, 12, BALL)[-1].flights
+    end = hovering(tmp_path, 12, "throw 0.6 2 6 10 0 0 4", place="12 2 2", size="0.4", kind="sphere")[-1].flights
     assert int(end.outcome) == Outcome.COLLISION
     expected = 2 * 0.26 + 2 - (0.4 + CONFIG.drone.body_radius_m) / 6
     assert float(end.flight_seconds) == pytest.approx(expected, abs=0.02)
 
 
 def test_a_flight_that_is_over_keeps_the_map_of_its_last_command(tmp_path: Path) -> None:
-    seen = hovering(tmp_path, 7, place="7 10 4", size="1 1 1", velocity="-2 0 0  2 10 4  7 10 4")
+    seen = hovering(tmp_path, 7, "bounce -2 0 0  2 10 4  7 10 4", place="7 10 4", size="1 1 1")
     last, before, over = (np.asarray(seen[n].grid.log_odds) for n in (5, 4, 7))
     assert np.any(last != before)
     np.testing.assert_array_equal(over, last)

@@ -16,6 +16,15 @@ TOLERANCE = {"A*": 2e-4, "A* 1 m": 2e-4}
 BUDGET = Budget(seconds=1.0)
 
 
+def assert_path_is_free(name: str, task: PlanningTask, samples: int) -> None:
+    plan = load_planner(name)(task, Budget(seconds=600.0, steps=samples if name in ("RRT*", "BIT*") else None))
+    if name == "APF" and not plan.found:
+        assert "local minimum" in plan.reason or "drives the drone into" in plan.reason
+        return
+    assert_flyable(task, plan.path, TOLERANCE.get(name, 0.0))
+    assert plan.reason == ""
+
+
 @pytest.mark.parametrize("world", WITHOUT_A_WAY)
 @pytest.mark.parametrize("name", PLANNERS)
 def test_without_a_way_it_says_no_path(name, world):
@@ -35,12 +44,7 @@ def test_a_goal_in_a_wall_is_no_path(name):
 @pytest.mark.parametrize("name", PLANNERS)
 def test_every_path_in_a_small_world_is_free(name, seed):
     task = random_small_world(seed)
-    plan = load_planner(name)(task, Budget(seconds=600.0, steps=2000 if name in ("RRT*", "BIT*") else None))
-    if name == "APF" and not plan.found:
-        assert "local minimum" in plan.reason or "drives the drone into" in plan.reason
-        return
-    assert_flyable(task, plan.path, TOLERANCE.get(name, 0.0))
-    assert plan.reason == ""
+    assert_path_is_free(name, task, samples=2000)
 
 
 @pytest.mark.slow
@@ -50,8 +54,4 @@ def test_every_path_in_a_large_world_is_free(name, world):
     kind, *index = world.split()
     scene = random_scene(kind, world_key("test", int(index[0]))) if index else load_scene(resolve_world(kind))
     task = PlanningTask.from_scene(scene, body_radius=RADIUS)
-    plan = load_planner(name)(task, Budget(seconds=600.0, steps=4000 if name in ("RRT*", "BIT*") else None))
-    if name == "APF" and not plan.found:
-        assert "local minimum" in plan.reason or "drives the drone into" in plan.reason
-        return
-    assert_flyable(task, plan.path, TOLERANCE.get(name, 0.0))
+    assert_path_is_free(name, task, samples=4000)

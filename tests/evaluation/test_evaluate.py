@@ -160,6 +160,14 @@ def test_a_policy_that_sees_nothing_has_nothing_to_shuffle(tmp_path):
         evaluate_command(EvaluateArgs(tmp_path, missions=4, shuffle_codes=True))
 
 
+def stand_in_for_flights(monkeypatch: pytest.MonkeyPatch, fly: Callable[..., Flights]) -> None:
+    """Replaces what would compile, flights by `fly`."""
+    monkeypatch.setattr(evaluation, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
+    monkeypatch.setattr(evaluation, "fly_on_all_devices", fly)
+    monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
+    monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
+
+
 @pytest.mark.parametrize("shuffle_codes", [True, False])
 def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, run, tmp_path, monkeypatch, capsys):
     asked = []
@@ -168,11 +176,7 @@ def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, r
         asked.append(options)
         return four_flights()
 
-    # Stand-ins for what would compile.
-    monkeypatch.setattr(evaluation, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
-    monkeypatch.setattr(evaluation, "fly_on_all_devices", fly)
-    monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
-    monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
+    stand_in_for_flights(monkeypatch, fly)
     evaluate_command(EvaluateArgs(run, missions=4, shuffle_codes=shuffle_codes, json=tmp_path / "figures.json"))
     flags = {"record": False, "shuffle_codes": shuffle_codes, "decoder_errors": False}
     assert asked == [{"actor": AgentActor(CONFIG), **flags}]
@@ -187,11 +191,7 @@ def test_the_command_flies_under_the_conditions_that_it_is_given_and_says_so(run
         flown.append(config)
         return four_flights()
 
-    # Stand-ins for what would compile.
-    monkeypatch.setattr(evaluation, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
-    monkeypatch.setattr(evaluation, "fly_on_all_devices", fly)
-    monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
-    monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
+    stand_in_for_flights(monkeypatch, fly)
     conditions = {"air": {"gusts_m_s": 5.0}, "env": {"action_delay": 1}}
     evaluate_command(EvaluateArgs(run, missions=4, conditions=conditions, json=tmp_path / "figures.json"))
     assert flown == [apply_layer(CONFIG, conditions, "test")] != [CONFIG]
@@ -213,11 +213,7 @@ def test_the_phases_of_an_evaluation_are_shown(run, monkeypatch, capsys):
         phase("flying")
         return four_flights()
 
-    # Stand-ins for what would compile.
-    monkeypatch.setattr(evaluation, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
-    monkeypatch.setattr(evaluation, "fly_on_all_devices", fly)
-    monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
-    monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
+    stand_in_for_flights(monkeypatch, fly)
     shown: list[str] = []
     monkeypatch.setattr(cli_evaluate, "show_phase", shown.append)
     evaluate_command(EvaluateArgs(run, missions=4))

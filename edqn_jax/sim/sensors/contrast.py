@@ -6,13 +6,11 @@ encoder reads are log-brightness changes in units of `REFERENCE`, whatever the c
 
 from __future__ import annotations
 
-import math
-
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import EventsConfig
+from edqn_jax.keys import log_uniform
 
 REFERENCE = 0.05
 """Contrast at which one event is one unit of what the encoder reads."""
@@ -33,8 +31,7 @@ def nominal_contrast(events: EventsConfig) -> float:
 
 def sample_contrast(events: EventsConfig, key: Array) -> Array:
     """Returns an episode's contrast [], log-uniform between the least and the most; `key` is consumed."""
-    least, most = math.log(events.least_contrast), math.log(events.most_contrast)
-    return jnp.exp(jax.random.uniform(key, minval=least, maxval=most))
+    return log_uniform(key, events.least_contrast, events.most_contrast)
 
 
 def value_of(contrast: Array) -> Array:

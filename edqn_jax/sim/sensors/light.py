@@ -6,13 +6,11 @@ the sun. What they do is the sensor's: `photoreceptor` for events, `exposure` fo
 
 from __future__ import annotations
 
-import math
-
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import LightConfig
+from edqn_jax.keys import log_uniform
 
 MIDDLE_LUX, HALF_DECADES = 10.0**1.5, 2.5
 """Illuminance that the networks know as 0, and its decades up to 1: from -1 at 0.1 lux to 1 at 10 000."""
@@ -25,8 +23,7 @@ def is_on(light: LightConfig) -> bool:
 
 def sample_illuminance(light: LightConfig, key: Array) -> Array:
     """Returns an episode's illuminance [] lux, log-uniform between the least and the most; `key` is consumed."""
-    least, most = math.log(light.least_lux), math.log(light.most_lux)
-    return jnp.exp(jax.random.uniform(key, minval=least, maxval=most))
+    return log_uniform(key, light.least_lux, light.most_lux)
 
 
 def value_of(lux: Array) -> Array:

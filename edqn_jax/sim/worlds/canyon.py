@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from edqn_jax.keys import uniform_parts
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.worlds import building, discs
 from edqn_jax.sim.worlds.free_points import TRIES
@@ -49,8 +50,7 @@ def sample_canyon(key: Array) -> Scene:
     """
     buildings, parts = LARGE + SMALL, LARGE * _PARTS + SMALL * _PARTS // 2
     counts = (buildings * _OF_A_BUILDING, buildings * 2 * discs.PLACES, parts * building.COLOUR_DRAWS, 2 * TRIES * 3)
-    draws = jax.random.uniform(key, (sum(counts),))
-    plans, places, colours, ends = jnp.split(draws, [sum(counts[:1]), sum(counts[:2]), sum(counts[:3])])
+    plans, places, colours, ends = uniform_parts(key, counts)
     plan = plans.reshape(buildings, _OF_A_BUILDING)
     is_large = jnp.arange(buildings) < LARGE
     narrow, wide = (jnp.where(is_large, large, small) for large, small in zip(*REACHES, strict=True))

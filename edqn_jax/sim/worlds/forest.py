@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
+from edqn_jax.keys import uniform_parts
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.worlds import building, discs
 from edqn_jax.sim.worlds.free_points import TRIES
@@ -41,8 +41,7 @@ def sample_forest(key: Array) -> Scene:
     """
     shapes = TREES + WITH_BRANCH
     counts = (TREES * _OF_A_TREE, TREES * 2 * discs.PLACES, shapes * building.COLOUR_DRAWS, 2 * TRIES * 3)
-    draws = jax.random.uniform(key, (sum(counts),))
-    sizes, places, colours, ends = jnp.split(draws, [sum(counts[:1]), sum(counts[:2]), sum(counts[:3])])
+    sizes, places, colours, ends = uniform_parts(key, counts)
     size = sizes.reshape(TREES, _OF_A_TREE)
     trunk = building.scale_uniforms(TRUNK_RADIUS, size[:, 0])
     length = building.scale_uniforms(BRANCH_LENGTH, size[:WITH_BRANCH, 1])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
+from edqn_jax.keys import uniform_parts
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.worlds import building
 from edqn_jax.sim.worlds.free_points import TRIES
@@ -47,8 +47,7 @@ def sample_rooms(key: Array) -> Scene:
     shapes = _WALLS * _PIECES + 4
     lines, colours = 2 * (ROOMS - 1), (_WALLS + 5) * building.COLOUR_DRAWS
     counts = (1 + lines, _WALLS * _OF_A_WALL, colours, 2 * TRIES * 3)
-    draws = jax.random.uniform(key, (sum(counts),))
-    plan, walls, shades, ends = jnp.split(draws, [sum(counts[:1]), sum(counts[:2]), sum(counts[:3])])
+    plan, walls, shades, ends = uniform_parts(key, counts)
     height = building.scale_uniforms(HEIGHT, plan[0])
     even = SIDE / ROOMS * jnp.arange(1, ROOMS)[None]
     # Along x and along y: [2, ROOMS + 1] metres, where walls stand, outer ones included.
