@@ -16,6 +16,9 @@ from typing import Any
 
 from edqn_jax.errors import ConfigError
 
+IMPORTED: list[str] = []
+"""What this process' command imported with `--import`; commands that go on from it need the same."""
+
 
 def load_module(name: str) -> ModuleType:
     """Imports a Python file by its path, or a module by its name, also one of the current folder; executed once.

@@ -27,7 +27,7 @@ from edqn_jax.cli.world import WorldArgs, parse_world, world_command
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, error_sentence, suggest_nearest
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.native.shipped import describe_library
-from edqn_jax.user_code import load_module
+from edqn_jax.user_code import IMPORTED, load_module
 from edqn_jax.version import package_version
 
 DONE = 0
@@ -163,6 +163,7 @@ def import_module_or_file(name: str) -> None:
     from edqn_jax.devices.forks import has_found_devices
 
     load_module(name)
+    IMPORTED.append(name)
     if has_found_devices():
         raise ConfigError(
             f"'{name}' computes with JAX while it is imported, before the devices are known; make its arrays within "

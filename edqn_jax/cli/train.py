@@ -20,7 +20,7 @@ from edqn_jax.cli.arguments import check_flags, flags_of_group
 from edqn_jax.cli.help import TRAIN, asks_for_help, flag_of, show_train_help
 from edqn_jax.cli.process.parsing import parse_or_say
 from edqn_jax.cli.process.signals import Stops
-from edqn_jax.cli.process.status import end_status, show_phase
+from edqn_jax.cli.process.status import BEGAN, end_status, show_phase
 from edqn_jax.cli.process.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import apply_layer, load_layer, resolve_config, to_yaml
@@ -270,7 +270,7 @@ def _open_progress(writes: bool) -> Progress:
     from edqn_jax.report.progress import Progress
 
     tell = (lambda *_: end_status()) if sys.stdout.isatty() else show_phase
-    return Progress(Console(quiet=not writes), tell=tell)
+    return Progress(Console(quiet=not writes), tell=tell, began=BEGAN)
 
 
 def _warnings(config: Config, start: Policy | None) -> tuple[str, ...]:

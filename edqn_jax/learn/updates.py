@@ -22,6 +22,7 @@ from edqn_jax.learn import samples
 from edqn_jax.learn.actor import PolicyParams
 from edqn_jax.learn.learner import VAE_METRICS, Metrics, State, UpdateStats, learner_of
 from edqn_jax.learn.perception import embedding, vae
+from edqn_jax.learn.policy import Policy
 from edqn_jax.learn.qnetwork import Params, skip_nonfinite
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.schedule import Schedule
@@ -86,6 +87,19 @@ def begin_networks(config: Config, fresh: Networks, known: Config, policy: Polic
         encoder=embedding.inference_params(config, vae),
         agent=learner.begin_from(config, fresh.agent, policy.q),
     )
+
+
+def check_begins(config: Config, policy: Policy) -> None:
+    """Raises unless training can begin with a policy; computes nothing.
+
+    Raises:
+        ConfigError: as `begin_networks`.
+    """
+
+    def begin(key: Array) -> Networks:
+        return begin_networks(config, init_networks(config, key), policy.config, policy.params)
+
+    jax.eval_shape(begin, jax.random.key(0))
 
 
 def _vae_optimiser(rate: Array | float) -> optax.GradientTransformation:

@@ -36,6 +36,9 @@ them by their names."""
 MAX_OWN = 6
 """Metrics of a learner that are shown by their names, the first ones."""
 
+FORGOTTEN_S = 60.0
+"""After so many seconds a measurement counts half for the time that is left: machines become slower and faster."""
+
 LASTING = ("episodes", "success_rate", "validation_success", "mean_return")
 """Metrics that stay on show until a newer value comes; the others vanish where a chunk has none."""
 
@@ -43,10 +46,17 @@ LASTING = ("episodes", "success_rate", "validation_success", "mean_return")
 class Progress:
     """Shows the phases of a run, each with a clock, and the metrics of its training."""
 
-    def __init__(self, console: Console | None = None, every_s: float = 2.0, tell: ShowPhase = show_nothing) -> None:
+    def __init__(
+        self,
+        console: Console | None = None,
+        every_s: float = 2.0,
+        tell: ShowPhase = show_nothing,
+        began: float | None = None,
+    ) -> None:
         """Writes to `console`, or standard output; without a terminal, a line for each phase and each `every_s`.
 
-        `tell` is called with the name of each phase, and with how much of it is done.
+        `tell` is called with the name of each phase, and with how much of it is done. The clock runs from `began` on,
+        seconds of `time.monotonic`, or from now on.
         """
         self._tell = tell
         self._console = console or Console()
@@ -54,14 +64,15 @@ class Progress:
         self._live: Live | None = None
         self._metrics: dict[str, Any] = {}
         self._phase, self._total, self._counted = "starting", 0, (0, 0)
-        self._started = self._phase_started = time.monotonic()
-        self._printed = self._started - every_s
+        self._phase_started = time.monotonic()
+        self._started = self._phase_started if began is None else began
+        self._printed = self._phase_started - every_s
         self._updated: tuple[float, int] | None = None  # when, and after how many decisions
-        self._measured_s, self._measured = 0.0, 0  # seconds and decisions that the rate is made of
+        self._measured_s, self._measured = 0.0, 0.0  # seconds and decisions that the rate is made of
 
     @property
     def elapsed_s(self) -> float:
-        """Seconds since this was made."""
+        """Seconds since the clock began."""
         return time.monotonic() - self._started
 
     def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
@@ -123,12 +134,14 @@ class Progress:
     def _measure(self, now: float) -> None:
         """Adds the newest decisions to the rate, unless the VAE was trained, too: then they take much longer."""
         if self._updated is not None and self._phase not in ("warm-up", "retraining"):
-            self._measured_s += now - self._updated[0]
-            self._measured += self._decisions() - self._updated[1]
+            took = now - self._updated[0]
+            kept = 0.5 ** (took / FORGOTTEN_S)
+            self._measured_s = kept * self._measured_s + took
+            self._measured = kept * self._measured + self._decisions() - self._updated[1]
         self._updated = (now, self._decisions())
 
     def _remaining(self) -> str:
-        """Returns the time that the rest of training takes at the rate so far, validations included, as text.
+        """Returns the time that the rest of training takes at the rate of late, validations included, as text.
 
         Nothing is known in the warm-up, and a retraining of the VAE that is still to come is not in it.
         """

@@ -11,6 +11,7 @@ from edqn_jax.evaluation.metrics import clearance_text, format_duration
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.training.setup import TrainingSetup
+from edqn_jax.user_code import IMPORTED
 
 
 def describe_start(preparation: TrainingSetup, seeds: int | None) -> str:
@@ -66,8 +67,8 @@ def _next_commands(summary: dict[str, Any], run: RunDirectory, config: Config) -
     more = 2 * config.train.total_steps
     return "\n".join(
         (
-            f"see it:       edqn report {_word(run.path)}",
-            f"fly it:       edqn evaluate {_word(flies)} --missions 100",
+            f"see it:       edqn report {_word(run.path)}{_imports()}",
+            f"fly it:       edqn evaluate {_word(flies)} --missions 100{_imports()}",
             f"train longer: {_train_command(run.path)} --total-steps {more}",
         )
     )
@@ -75,10 +76,15 @@ def _next_commands(summary: dict[str, Any], run: RunDirectory, config: Config) -
 
 def _train_command(folder: Path) -> str:
     """Returns the command that goes on with the run in a folder, whose options are its own."""
-    return f"edqn train --run-dir {_word(folder)}"
+    return f"edqn train --run-dir {_word(folder)}{_imports()}"
 
 
-def _word(path: Path) -> str:
+def _imports() -> str:
+    """Returns the words by which a command imports what this one did."""
+    return "".join(f" --import {_word(name)}" for name in IMPORTED)
+
+
+def _word(path: Path | str) -> str:
     """Returns a path as a word of a shell."""
     return shlex.quote(str(path))
 

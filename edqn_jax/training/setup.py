@@ -27,6 +27,7 @@ from edqn_jax.keys import run_streams
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.learn.state import TrainState
 from edqn_jax.learn.trainer import Trainer
+from edqn_jax.learn.updates import check_begins
 from edqn_jax.planning.astar import Path as ShortestPath
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.sim.task.env import EnvParams, check_sensor
@@ -93,6 +94,8 @@ class TrainingSetup:
             validate(each)
             check_learns(each)
         check_learner(config)
+        if start is not None:
+            check_begins(config, start)
         self.config, self.display, self.pool, self.began = config, display, pool, time.perf_counter()
         self.start = start
         display.phase("preparing worlds")

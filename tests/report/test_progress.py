@@ -104,6 +104,21 @@ def test_the_estimate_is_made_of_training_alone(monkeypatch):
     assert (warm_up, training, retraining, last) == ("–", "1:20", "1:10", "1:00")
 
 
+def test_the_estimate_follows_a_machine_that_becomes_slower(monkeypatch):
+    """600 decisions at 10 a second, then at 1: after some minutes the 100 that are left take nearly 100 s."""
+    now, out = [0.0], io.StringIO()
+    monkeypatch.setattr("edqn_jax.report.progress.time.monotonic", lambda: now[0])
+    progress = Progress(Console(file=out, width=200), every_s=0.0, began=-20.0)
+    progress.phase("training", total=1000)
+    for decisions in (*range(10, 610, 10), *range(610, 910, 10)):
+        now[0] += 1.0 if decisions <= 600 else 10.0
+        progress.update({"phase": "training", "decisions": decisions})
+    line = out.getvalue().splitlines()[-1]
+    minutes, seconds = line.split("training left ")[1].split(":")
+    assert 85 <= 60 * int(minutes) + int(seconds) <= 100
+    assert line.startswith("[6:20]")  # 360 s, and the 20 before
+
+
 def test_stopping_what_never_started_is_harmless():
     Progress(Console(file=io.StringIO())).stop()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -64,6 +65,14 @@ def test_networks_of_other_shapes_and_learners_that_cannot_are_refused(monkeypat
     for config, policy in ((wide, POLICY), (SMALL, Policy(BODY, fresh_policy(BODY)))):
         with pytest.raises(edqn_jax.ConfigError, match="have other shapes than those of the policy"):
             begin(config, policy)
+    phases = []
+    display = SimpleNamespace(phase=phases.append)
+    with (
+        pytest.raises(edqn_jax.ConfigError, match="have other shapes"),
+        set_up_training(wide, display=display, start=POLICY),  # type: ignore[arg-type]
+    ):
+        pass
+    assert not phases  # nothing was prepared or compiled
     monkeypatch.setitem(LEARNERS._entries, "dqn", dataclasses.replace(learner_of(SMALL), begin_from=None))
     with pytest.raises(edqn_jax.ConfigError, match="learner 'dqn' cannot begin with a policy"):
         begin(SMALL)

@@ -16,6 +16,9 @@ from collections.abc import Iterator, Sequence
 
 from edqn_jax.cli.process.streams import Lasting
 
+BEGAN = time.monotonic()
+"""When this process began, about."""
+
 TICK_S = 0.25
 """Between two drawings of the line on a terminal."""
 
