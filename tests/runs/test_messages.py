@@ -74,6 +74,13 @@ def test_the_last_lines_are_commands_that_work_in_any_folder(
     assert (options.run_dir, config.train.total_steps) == (run.path, 8192)
 
 
+def test_the_next_commands_import_what_this_one_did(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("edqn_jax.runs.messages.IMPORTED", ["my sensor.py", "mine"])
+    lines = verdict(ONE, RunDirectory(Path("here")), CONFIG).splitlines()[-3:]
+    for line in (*lines, describe_stop(RunDirectory(Path("here")), 2048, None)):
+        assert " --import 'my sensor.py' --import mine" in line
+
+
 def test_a_run_that_was_stopped_names_the_command_that_resumes_it() -> None:
     said = describe_stop(RunDirectory(Path("runs/of mine")), 2048, None)
     assert said.endswith("; edqn train --run-dir 'runs/of mine' goes on from there") and "\n" not in said
