@@ -2,7 +2,8 @@
 
 import sys
 
-from edqn_jax.cli import main
+from edqn_jax.cli import run
 
 if __name__ == "__main__":
-    sys.exit(main(["train", *sys.argv[1:]]))
+    sys.argv.insert(1, "train")
+    run()

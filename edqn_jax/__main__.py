@@ -1,8 +1,6 @@
 """`python -m edqn_jax`: the same as `edqn`."""
 
-import sys
-
-from edqn_jax.cli import main
+from edqn_jax.cli import run
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,4 +26,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         return exit_code(outputs, code)
 
 
-__all__ = ["main"]
+def run() -> NoReturn:
+    """Runs the command of this process, and ends it."""
+    from edqn_jax.cli.process.ending import end_process
+
+    end_process(main())
+
+
+__all__ = ["main", "run"]
