@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, PercentFormatter
+from matplotlib.ticker import EngFormatter, LogFormatter, PercentFormatter, StrMethodFormatter
 
 from edqn_jax.learn.learner import VAE_METRICS, learner_metrics
 from edqn_jax.report.style import INK, LINE, OUTCOME_COLOURS, OUTCOME_LABELS, SECOND_LINE, open_figure
@@ -136,6 +136,8 @@ def _plot_vae(axes: Axes, metrics: Sequence[Mapping[str, Any]]) -> None:
 def _scale_logarithmically(axes: Axes) -> None:
     if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axes.get_lines()):
         axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))  # 60 and 0.01, not powers of ten
+        axes.yaxis.set_minor_formatter(LogFormatter())
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:

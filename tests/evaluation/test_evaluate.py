@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from edqn_jax.evaluation.judge import load_judge, replay_contact
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.metrics import shortest_paths, spl, summarise_flights, wilson_interval
 from edqn_jax.evaluation.missions import MissionSet, load_missions
+from edqn_jax.evaluation.rollouts import ShowPhase
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.checkpoints.params import save_params
@@ -209,20 +209,21 @@ def test_the_command_flies_under_the_conditions_that_it_is_given_and_says_so(run
 
 
 def test_the_phases_of_an_evaluation_are_shown(run, monkeypatch, capsys):
-    def fly(*_: object, phase: Callable[[str], None], **__: object) -> Flights:
-        phase("flying")
+    def fly(*_: object, phase: ShowPhase | None, **__: object) -> Flights:
+        if phase is not None:  # else nobody is told, and all is flown at once
+            phase("flying the missions", 1, 4)
         return four_flights()
 
     stand_in_for_flights(monkeypatch, fly)
-    shown: list[str] = []
-    monkeypatch.setattr(cli_evaluate, "show_phase", shown.append)
+    shown: list[tuple[object, ...]] = []
+    monkeypatch.setattr(cli_evaluate, "show_phase", lambda *words: shown.append(words))
     evaluate_command(EvaluateArgs(run, missions=4))
     assert shown == [
-        "loading the policy",
-        "preparing worlds",
-        "flying",
-        "shortest paths",
-        "measuring the latency",
+        ("loading the policy",),
+        ("preparing worlds",),
+        ("flying the missions", 1, 4),
+        ("shortest paths",),
+        ("measuring the latency",),
     ]
     said = capsys.readouterr()
     assert "reached the goal" in said.out and said.err == ""

@@ -12,9 +12,9 @@ from typing import NoReturn
 def end_process(code: int) -> NoReturn:
     """Ends this process with an exit code as soon as its output is written.
 
-    Functions registered with `atexit` are called, but for JAX's, which takes its programs apart, and no thread is waited
-    for, such as one that compiles what nobody will run: on a busy machine both take up to half a minute. Of a cluster's
-    processes, which take leave of one another, each ends in the usual way.
+    Functions registered with `atexit` are called, but for JAX's, which takes its programs apart, and no thread is
+    waited for, such as one that compiles what nobody will run: on a busy machine both take up to half a minute. Of a
+    cluster's processes, which take leave of one another, each ends in the usual way.
     """
     jax = sys.modules.get("jax")
     if jax is not None:
