@@ -36,7 +36,7 @@ def rate_interval(success: np.ndarray) -> tuple[float, float]:
     return percentile_interval(bootstrap_rates([success])[0])
 
 
-def bootstrap_rates(strata: list[np.ndarray], draws: int = DRAWS, seed: int = 0) -> np.ndarray:
+def bootstrap_rates(strata: list[np.ndarray], draws: int = DRAWS) -> np.ndarray:
     """Returns success rates [strata, draws] of bootstrap draws; `strata` are [seeds, missions] bool, of equal missions.
 
     Raises:
@@ -46,7 +46,7 @@ def bootstrap_rates(strata: list[np.ndarray], draws: int = DRAWS, seed: int = 0)
     if len(missions) != 1:
         raise ValueError(f"strata must have the same missions, not {sorted(missions)} of them")
     (count,) = missions
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(0)
     times = random.multinomial(count, np.full(count, 1 / count), size=draws)  # [draws, M]
     rates = []
     for success in strata:

@@ -17,10 +17,11 @@ EMPTY_M = 1e5
 """A clearance beyond this is that of a world without shapes, metres: absent shapes are parked further away."""
 
 
-def wilson_interval(successes: int, missions: int, z: float = 1.959964) -> tuple[float, float]:
-    """Returns the Wilson score interval of a success rate; 95 % for the default `z` (Wilson 1927)."""
+def wilson_interval(successes: int, missions: int) -> tuple[float, float]:
+    """Returns the 95 % Wilson score interval of a success rate (Wilson 1927)."""
     if missions == 0:
         return 0.0, 1.0
+    z = 1.959964  # standard deviations that hold 95 % of a normal distribution
     rate = successes / missions
     scale = 1.0 + z * z / missions
     middle = (rate + z * z / (2 * missions)) / scale

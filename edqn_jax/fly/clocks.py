@@ -6,6 +6,12 @@ import collections
 import time
 from typing import Protocol
 
+WINDOW_S = 5.0
+"""Samples of so long decide a clock's offset."""
+
+JUMP_S = 0.1
+"""An offset that differs by more is that of a clock that has jumped."""
+
 
 class Clock(Protocol):
     """The host's clock, real or simulated."""
@@ -46,14 +52,13 @@ class WallClock:
 
 
 class ClockOffset:
-    """Seconds to add to another clock's to have the host's: that of the sample with the least delay of some seconds.
+    """Seconds to add to another clock's to have the host's: that of the sample with the least delay in `WINDOW_S`.
 
-    As the window moves on, so does a clock that drifts. One that jumps by more than `jump_s` is followed after three
+    As the window moves on, so does a clock that drifts. One that jumps by more than `JUMP_S` is followed after three
     samples that agree.
     """
 
-    def __init__(self, window_s: float = 5.0, jump_s: float = 0.1) -> None:
-        self._window_s, self._jump_s = window_s, jump_s
+    def __init__(self) -> None:
         self._samples: collections.deque[tuple[float, float, float]] = collections.deque()
         self._strange: list[tuple[float, float, float]] = []
         self.value: float | None = None
@@ -76,7 +81,7 @@ class ClockOffset:
 
     def _add(self, offset: float, delay: float, now: float) -> None:
         sample = (now, delay, offset)
-        if self.value is not None and abs(offset - self.value) > self._jump_s:
+        if self.value is not None and abs(offset - self.value) > JUMP_S:
             self._strange.append(sample)
             if len(self._strange) < 3:
                 return
@@ -86,6 +91,6 @@ class ClockOffset:
         else:
             self._samples.append(sample)
         self._strange.clear()
-        while self._samples[0][0] < now - self._window_s:
+        while self._samples[0][0] < now - WINDOW_S:
             self._samples.popleft()
         self.value = min(self._samples, key=lambda each: each[1])[2]

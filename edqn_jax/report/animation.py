@@ -394,12 +394,12 @@ def _mp4(frames: list[Image.Image], fps: float) -> bytes:
         return file.read_bytes()
 
 
-def _palette(frames: list[Image.Image], number: int, many: int = 8) -> Image.Image:
+def _palette(frames: list[Image.Image], number: int) -> Image.Image:
     """Returns an image with the palette of all frames.
 
     Vivid colours have a share of their own: they are few pixels, but marks, events and paths are made of them.
     """
-    chosen = np.unique(np.linspace(0, len(frames) - 1, many).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(frames) - 1, 8).round().astype(int))
     pixels = np.concatenate([np.asarray(frames[i]).reshape(-1, 3) for i in chosen])
     vivid = np.ptp(pixels.astype(int), axis=1) > VIVID
     colours = [_main_colours(pixels[vivid], VIVID_COLOURS), _main_colours(pixels[~vivid], number - VIVID_COLOURS)]

@@ -59,8 +59,6 @@ class Setup:
     """As in `Pilot`."""
     autopilot: tuple[str, ...] = ()
     """More options of `edqn fly`."""
-    vehicle: tuple[str, ...] = ()
-    """More options of the vehicle."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +147,7 @@ def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
         port, let_go = hold_udp_port()
         stack.callback(let_go)
         yaw = float(np.arctan2(goal[1] - start[1], goal[0] - start[0]))
-        words = _vehicle_words(start, yaw, port, keeper.address, number, setup)
+        words = _vehicle_words(start, yaw, port, keeper.address, number)
         vehicle = stack.enter_context(_process(words, quiet=False))
         words = _autopilot_words(config, scene, port, server.address, keeper.address, out, setup)
         autopilot = stack.enter_context(_process(words, quiet=True))
@@ -224,10 +222,10 @@ def _see(environment: Environment, number: int, setup: Setup, stack: contextlib.
     return drawn.see
 
 
-def _vehicle_words(start: NDArray, yaw: float, port: int, clock: str, seed: int, setup: Setup) -> list[str]:
+def _vehicle_words(start: NDArray, yaw: float, port: int, clock: str, seed: int) -> list[str]:
     place = [repr(float(each)) for each in start]
     words = ["-m", "edqn_jax.fly.simulated.vehicle", "--mavlink", f"udpout:127.0.0.1:{port}", "--start", *place]
-    return [*words, f"--yaw={yaw!r}", "--seed", str(seed), "--clock", clock, *setup.vehicle]
+    return [*words, f"--yaw={yaw!r}", "--seed", str(seed), "--clock", clock]
 
 
 def _autopilot_words(

@@ -122,7 +122,7 @@ CANYON = Family(canyon.sample_canyon, canyon.SIZE, edge_m=0.7, bodies=canyon.BOD
 OPEN, MIXED = Mixture(MIXTURES["open"]), Mixture(MIXTURES["mixed"], detours=True)
 
 
-def random_scene(family: str, key: Array, moving: Moving = STILL) -> Scene:
+def random_scene(family: str, key: Array) -> Scene:
     """Returns a random world with a start, a goal, and a way between them for a sphere of `RADIUS_M`.
 
     Motion is added to the static world of the same key; reachability is checked at time 0.
@@ -130,18 +130,17 @@ def random_scene(family: str, key: Array, moving: Moving = STILL) -> Scene:
     Args:
         family: of `FAMILIES`; a world of a mixture is of one of its families.
         key: consumed.
-        moving: what moves.
 
     Raises:
         ConfigError: if there is no such family.
     """
     if isinstance(_entry(family), Mixture):
         family = families_of(family, key[None])[0]
-    return take_scene(_sample_worlds(family, key[None], _moving_in(family, moving)), 0)
+    return take_scene(_sample_worlds(family, key[None], _moving_in(family, STILL)), 0)
 
 
 def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
-    """Returns a pool of random worlds, one for each of `keys` [P]; see `random_scene`."""
+    """Returns a pool of random worlds in which `moving` moves, one for each of `keys` [P]; see `random_scene`."""
     mixture = _entry(family)
     if not isinstance(mixture, Mixture):
         return _in_batches(family, _moving_in(family, moving), keys)

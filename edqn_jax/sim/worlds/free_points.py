@@ -42,33 +42,9 @@ class Cells:
     edge_m: Array  # [] metres
 
 
-def free_point(
-    scene: Scene,
-    key: Array,
-    *,
-    clearance: float = CLEARANCE,
-    altitudes: tuple[float, float] | None = None,
-    away_from: Array | None = None,
-    distance: float = 0.0,
-) -> Array:
-    """Returns a random free point of the flight volume, uniform up to the conditions.
-
-    It is the first of `TRIES` uniform candidates that meets the conditions; if none does, the one that violates
-    them least.
-
-    Args:
-        scene: one world.
-        key: consumed.
-        clearance: metres to the nearest surface, at least.
-        altitudes: lowest and highest z, metres; None is the full height of the volume.
-        away_from: [3] metres, a point to keep a distance from.
-        distance: least distance to it, metres.
-
-    Returns:
-        [3] metres.
-    """
-    points = scatter_points(scene, jax.random.uniform(key, (TRIES, 3)), altitudes)
-    return first_free(scene, points, clearance, away_from, distance)
+def free_point(scene: Scene, key: Array) -> Array:
+    """Returns a random free point [3] of the flight volume, metres; `key` is consumed, see `first_free`."""
+    return first_free(scene, scatter_points(scene, jax.random.uniform(key, (TRIES, 3))), CLEARANCE)
 
 
 def far_apart(scene: Scene, uniforms: Array) -> tuple[Array, Array]:

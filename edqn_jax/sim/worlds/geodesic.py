@@ -48,9 +48,9 @@ class Field:
     edge: Array  # [P] metres
 
 
-def nodes_per_side(size: tuple[float, float, float], most: int = MAX_NODES) -> tuple[int, int, int]:
-    """Returns the number of nodes along each side of a volume, metres, with about `most` nodes in all, or fewer."""
-    edge = max(FINEST_M, (math.prod(size) / most) ** (1 / 3))
+def nodes_per_side(size: tuple[float, float, float]) -> tuple[int, int, int]:
+    """Returns the number of nodes along each side of a volume, metres, with about `MAX_NODES` in all, or fewer."""
+    edge = max(FINEST_M, (math.prod(size) / MAX_NODES) ** (1 / 3))
     across, along, levels = (max(2, math.ceil(side / edge)) for side in size)
     return across, along, levels
 

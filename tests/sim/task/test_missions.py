@@ -15,7 +15,7 @@ from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.scene.scene import Spheres, build_scene, stack_scenes
 from edqn_jax.sim.task.missions import AWAY, random_missions, spread_missions
 from edqn_jax.sim.worlds.families import random_pool, world_keys
-from edqn_jax.sim.worlds.free_points import CLEARANCE, FAR, free_point
+from edqn_jax.sim.worlds.free_points import CLEARANCE, FAR, TRIES, first_free, scatter_points
 from tests.support.drawn_scenes import clearances
 
 WORLDS, MISSIONS = 24, 512
@@ -77,5 +77,6 @@ def test_a_free_point_in_a_crowded_world_is_the_least_bad_one():
     # A ball that leaves free only the corners of the volume, none of them by 3 m.
     ball = Spheres(position=[5, 5, 5], radius=6, albedo=np.full(3, 0.5))
     scene = build_scene([ball], volume=[[0, 0, 0], [10, 10, 10]], start=[0, 0, 0], goal=[9, 9, 9])
-    point = free_point(scene, jax.random.key(0), clearance=3.0)
+    points = scatter_points(scene, jax.random.uniform(jax.random.key(0), (TRIES, 3)))
+    point = first_free(scene, points, 3.0)
     assert signed_distance(scene, point) > -0.5

@@ -72,7 +72,7 @@ class Material:
         return 2.0 / self.tile_m if self.tile_m else 1.0
 
 
-def painted_spec(config: CameraConfig, scene: Scene, *, title: str = "world") -> mujoco.MjSpec:
+def painted_spec(config: CameraConfig, scene: Scene) -> mujoco.MjSpec:
     """Returns one world as it looks in the package's camera at time 0: patterns, sun, ambient light and sky.
 
     Geometry and names are those of `mjcf_of`. A geom with a pattern has its colour in its texture, and white `rgba`.
@@ -80,9 +80,8 @@ def painted_spec(config: CameraConfig, scene: Scene, *, title: str = "world") ->
     Args:
         config: whose plaid and light a world has that has none of its own.
         scene: one world.
-        title: name of the model.
     """
-    text = mjcf_of(_lit(config, scene), title=title)
+    text = mjcf_of(_lit(config, scene))
     spec = mujoco.MjSpec.from_string(text)
     for material in _bake(config, scene, text):
         side = material.faces.shape[1]
