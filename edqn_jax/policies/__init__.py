@@ -36,6 +36,8 @@ def no_run(folder: Path) -> ConfigError:
     """Returns the error of a folder that holds no run, or of one that is not there."""
     if folder.is_dir():
         return ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
+    if folder.is_file():
+        return ConfigError(f"'{folder}' is a file; give the folder of a run")
     near = difflib.get_close_matches(str(folder), SHIPPED)
     return ConfigError(
         f"there is no run in '{folder}': " + (f"did you mean '{near[0]}'?" if near else "no such folder")

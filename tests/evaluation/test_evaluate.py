@@ -117,6 +117,8 @@ def test_no_run_an_empty_one_and_one_that_does_not_fit_are_sentences(tmp_path, r
     with pytest.raises(ConfigError, match="there is no run in"):
         load_run(tmp_path)
     (tmp_path / "config.yaml").write_text(to_yaml(Config()))
+    with pytest.raises(ConfigError, match="config.yaml' is a file; give the folder of a run"):
+        load_run(tmp_path / "config.yaml")
     with pytest.raises(ConfigError, match="there is no policy"):
         load_run(tmp_path)
     (tmp_path / "checkpoints").symlink_to(run / "checkpoints")

@@ -88,6 +88,8 @@ def resolve_world(name: str) -> Path:
     named = folder / f"{name}.xml"
     if path.name == name and named.is_file():
         return named
+    if path.is_dir():
+        raise SceneError(f"'{name}' is a folder; give a MuJoCo file")
     scenes = sorted(file.stem for file in folder.glob("*.xml"))
     known = f"scenes known by name: {', '.join(scenes) or 'none'}"
     if path.suffix == ".xml" or path.name != name:

@@ -240,6 +240,8 @@ def test_a_missing_scene_file_names_the_folder_searched(tmp_path):
     with pytest.raises(SceneError) as raised:
         resolve_world(str(tmp_path / "nowhere.xml"))
     assert f"there is no scene file 'nowhere.xml' in {tmp_path}; scenes known by name: " in message(raised)
+    with pytest.raises(SceneError, match="is a folder; give a MuJoCo file"):
+        resolve_world(str(tmp_path))
 
 
 def test_a_world_is_found_by_its_name_and_by_its_path():

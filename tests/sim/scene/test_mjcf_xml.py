@@ -134,6 +134,13 @@ def test_a_file_in_latin_1_is_read_and_one_in_utf_16_is_refused(tmp_path: Path, 
             load_world(file)
 
 
+def test_a_text_without_an_element_is_no_xml(tmp_path: Path) -> None:
+    file = tmp_path / "world.xml"
+    file.write_text("notes of a flight\n")
+    with pytest.raises(SceneError, match="it is no XML: it has no element"):
+        load_world(file)
+
+
 def test_messages_name_the_line_of_the_file(tmp_path: Path) -> None:
     file = tmp_path / "world.xml"
     before = "<!-- a\n -- b\n -->"

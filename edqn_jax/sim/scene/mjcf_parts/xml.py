@@ -59,6 +59,8 @@ class _Reader:
             between = self.text[at : begin if begin >= 0 else None]
             if between.strip(_BLANKS):
                 self.begun = True
+                if begin < 0 and self.root is None and not self.opened:
+                    raise MarkupError("it is no XML: it has no element")
                 if begin < 0:
                     raise self._error(at, "text must not be the last of all")
             self.written.append("\n" * between.count("\n"))
