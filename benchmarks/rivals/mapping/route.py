@@ -173,14 +173,26 @@ def _around(cell: float, beyond: float, within: float) -> np.ndarray:
 
 
 @numba.njit(nogil=True)
-def _is_around(known, unknown, around, i, j, k):
-    """Returns whether a cell at the offsets `around` [N, 3] from (i, j, k) is occupied, or unknown if `unknown`."""
+def _is_occupied_around(known, around, i, j, k):
+    """Returns whether one of the cells at the offsets `around` [N, 3] from (i, j, k) is occupied."""
     shape = known.log_odds.shape
     for n in range(around.shape[0]):
         a, b, c = i + around[n, 0], j + around[n, 1], k + around[n, 2]
         if 0 <= a < shape[0] and 0 <= b < shape[1] and 0 <= c < shape[2]:
-            odds = known.log_odds[a, b, c]
-            if (odds == 0.0) if unknown else (odds > known.occupied_above):
+            if known.log_odds[a, b, c] > known.occupied_above:
+                return True
+    return False
+
+
+# Two functions rather than one with a flag, for which the innermost loop would have to ask.
+@numba.njit(nogil=True)
+def _is_unknown_around(known, around, i, j, k):
+    """Returns whether one of the cells at the offsets `around` [N, 3] from (i, j, k) is unknown."""
+    shape = known.log_odds.shape
+    for n in range(around.shape[0]):
+        a, b, c = i + around[n, 0], j + around[n, 1], k + around[n, 2]
+        if 0 <= a < shape[0] and 0 <= b < shape[1] and 0 <= c < shape[2]:
+            if known.log_odds[a, b, c] == 0.0:
                 return True
     return False
 
@@ -190,12 +202,12 @@ def _weight(known, i, j, k):
     """Returns the cost of a metre through the cell (i, j, k)."""
     if known.log_odds[i, j, k] > known.occupied_above:
         return OCCUPIED_WEIGHT
-    if _is_around(known, False, known.touch, i, j, k):
+    if _is_occupied_around(known, known.touch, i, j, k):
         return TOUCHED_WEIGHT
     weight = 1.0
-    if known.unknown_weight > 1.0 and _is_around(known, True, known.body, i, j, k):
+    if known.unknown_weight > 1.0 and _is_unknown_around(known, known.body, i, j, k):
         weight = known.unknown_weight
-    if _is_around(known, False, known.near, i, j, k):
+    if _is_occupied_around(known, known.near, i, j, k):
         return max(weight, known.near_weight)
     return weight
 
@@ -301,8 +313,8 @@ def _known_length(known, points):
             i, j, k = _cell_of(
                 known, a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2])
             )
-            unseen = _is_around(known, True, known.body, i, j, k)
-            if unseen or _is_around(known, False, known.touch, i, j, k):
+            unseen = _is_unknown_around(known, known.body, i, j, k)
+            if unseen or _is_occupied_around(known, known.touch, i, j, k):
                 return total + length * n / steps
         total += length
     return total
