@@ -253,7 +253,9 @@ def test_the_warm_up_is_a_curve_of_its_training_steps(tmp_path):
     lines = {line.get_gid(): line for axes in figure.axes for line in axes.get_lines()}
     assert list(np.asarray(lines["reconstruction_loss"].get_xdata())) == [10, 20, 30, 80]
     assert list(np.asarray(lines["kl"].get_ydata())) == [1.0, 2.0, 3.0, 3.5]
-    numbers = {label.get_text() for label in lines["kl"].axes.get_yticklabels(which="both")}
+    axes = lines["kl"].axes
+    assert axes is not None
+    numbers = {label.get_text() for label in axes.get_yticklabels(which="both")}
     assert {"1", "10"} <= numbers and not any("$" in number for number in numbers)  # no powers of ten
 
 
