@@ -23,6 +23,7 @@ from edqn_jax.evaluation.world_check import (
 )
 from edqn_jax.runs.directory import to_plain_json
 from edqn_jax.sim.scene.mjcf import load_scene
+from edqn_jax.sim.scene.surface import SURFACE_NUMBERS
 from edqn_jax.sim.scene.survey import LEFT_OUT
 from tests.support.corridors import corridor
 from tests.support.meshes import CUBE, LUMP, hull, mesh_world
@@ -45,6 +46,14 @@ def test_a_tight_way_is_flown_with_a_warning(tmp_path: Path) -> None:
     (warning,) = check_world(ROOMS, str(corridor(tmp_path, width - 0.1))).warnings
     assert "is tight at (12, 6, 2.5): it passes" in warning and "0.91 m, 2.5 radii of the body" in warning
     assert check_world(ROOMS, str(corridor(tmp_path, width + 0.1))).warnings == ()
+
+
+def test_patterns_that_a_file_brings_are_warned_of_where_the_policy_knows_one_look(tmp_path: Path) -> None:
+    file, stripes = corridor(tmp_path, WIDE), "3 0.5 1 0 0 0.5 " + "0 " * (SURFACE_NUMBERS - 6)
+    custom = f'<custom><numeric name="surface:south" data="{stripes}"/></custom>'
+    file.write_text(file.read_text().replace("</mujoco>", f"{custom}</mujoco>"))
+    (warning,) = check_world(ROOMS, str(file)).warnings
+    assert "the shapes of this world have patterns of their own" in warning
 
 
 @pytest.mark.parametrize(
