@@ -25,7 +25,11 @@ TICK_S = 0.02
 """Setpoints are sent at 50 Hz."""
 
 PATIENCE_S = 0.012
-"""Longest that a decision waits for the camera's next packet, so that it is made on events that are new."""
+"""A decision waits for the camera's next packet, so that it is made on events that are new, if that is to be expected
+within this."""
+
+LATE_S = 0.003
+"""For so long after it was expected it is waited for."""
 
 GAP_S = 0.1
 """Longer gaps between setpoints are counted; PX4 leaves offboard mode after 0.5 s."""
@@ -36,7 +40,7 @@ class Latency:
     """Milliseconds from the newest event to the setpoint on the wire, of each decision, and its parts."""
 
     age: list[float] = dataclasses.field(default_factory=list)
-    """Since the camera knew of its newest event."""
+    """From when the camera knew of its newest event to when it was read."""
     read: list[float] = dataclasses.field(default_factory=list)
     """Taking events and telemetry from their sockets."""
     decide: list[float] = dataclasses.field(default_factory=list)
@@ -148,6 +152,8 @@ class Pilot:
                 self.link.request("hold")
             self._report("cut off")
             raise
+        finally:
+            gc.unfreeze()
         return self._report(self.state.outcome)
 
     def _report(self, outcome: str) -> Report:
@@ -163,6 +169,7 @@ class Pilot:
         self._read(now)
         if self.clock.passes and self.state.phase is Phase.FLYING and now >= self._due - 1e-6:
             awoke, now = self._await_packet()
+        read_at = now
         read_s = time.perf_counter() - awoke
         inputs = self._inputs()
         before = self.state.phase
@@ -189,15 +196,16 @@ class Pilot:
         self._send(output, now)
         if decides:
             send_s, spent_s = time.perf_counter() - began, time.perf_counter() - awoke - waited_s
-            self._keep_latency(now, read_s, decide_s, send_s, spent_s - read_s - decide_s - send_s)
+            self._keep_latency(read_at, read_s, decide_s, send_s, spent_s - read_s - decide_s - send_s)
         if self.state.phase is not before:
             self._tell(f"{now:.2f} s: {self.state.phase}" + (f" ({why})" if (why := self._why()) else ""))
 
     def _await_packet(self) -> tuple[float, float]:
-        """Reads until the camera's next packet is there, or patience ends; returns when it came, on both clocks."""
+        """Reads until the camera's next packet is there, if it is to come soon; returns when it came, on both clocks."""
         events = self.source.events
         awoke, now = time.perf_counter(), self.clock.now()
-        known, end = events.until_us, now + PATIENCE_S
+        known, expected = events.until_us, events.next_at()
+        end = now if expected is None or expected > now + PATIENCE_S else expected + LATE_S
         while events.until_us == known and now < end:
             self.source.wait(end - now)
             awoke, now = time.perf_counter(), self.clock.now()
@@ -283,10 +291,10 @@ class Pilot:
             self._gaps += sent_at - self._sent_at > GAP_S
         self._sent_at = sent_at
 
-    def _keep_latency(self, now: float, read_s: float, decide_s: float, send_s: float, rest_s: float) -> None:
-        packet_at, latency = self.source.events.packet_at, self.latency
+    def _keep_latency(self, read_at: float, read_s: float, decide_s: float, send_s: float, rest_s: float) -> None:
+        latency = self.latency
         seen_at = 1e-6 * self.source.events.until_us + (self.source.events.offset.value or 0.0)
-        latency.age.append(1e3 * max(0.0, (packet_at or now) - seen_at))
+        latency.age.append(1e3 * max(0.0, read_at - seen_at))
         parts = (latency.read, read_s), (latency.decide, decide_s), (latency.send, send_s), (latency.rest, rest_s)
         for part, spent in parts:
             part.append(1e3 * spent)

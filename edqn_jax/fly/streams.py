@@ -70,6 +70,13 @@ class Events:
         while self._packets[0][1] < until_us - self._keep_us:
             self._packets.popleft()
 
+    def next_at(self) -> float | None:
+        """Returns when the next packet is to be expected, on the host's clock; None before two have come."""
+        if len(self._packets) < 2 or self.offset.value is None:
+            return None
+        (_, before, _), (_, newest, _) = self._packets[-2], self._packets[-1]
+        return self.offset.value + 1e-6 * (2 * newest - before)
+
     def window(self, since_us: int, until_us: int) -> NDArray:
         """Returns the events [N] of `EVENT` from `since` to before `until`, microseconds of the camera's clock."""
         held, begin = [np.empty(0, EVENT)], -1
@@ -154,7 +161,7 @@ class SocketStream:
             self._socket = socket.create_connection((host, int(port)), START_S)
         except (OSError, ValueError) as error:
             raise ConfigError(f"there is no camera at '{address}' ({error}); write it as tcp:HOST:PORT") from error
-        self._decoder, self.events = Decoder(), Events()
+        self._decoder, self.events, self._has_ended = Decoder(), Events(), False
         try:
             self._read_header(address)
         except ConfigError:
@@ -182,13 +189,17 @@ class SocketStream:
             except (BlockingIOError, TimeoutError, ConnectionError):
                 return
             if not data:
+                self._has_ended = True
                 return
             for until, events in self._decoder.feed(data):
                 self.events.add(events, until, now)
 
     def wait(self, most_s: float) -> None:
         """Returns once something has come, or after so many seconds."""
-        select.select([self._socket], [], [], most_s)
+        if self._has_ended:  # its end could be read again and again
+            time.sleep(most_s)
+        else:
+            select.select([self._socket], [], [], most_s)
 
     def close(self) -> None:
         """Closes the connection."""

@@ -14,7 +14,7 @@ from edqn_jax.cli import fly as command
 from edqn_jax.errors import ConfigError
 from edqn_jax.fly.faults import Fault, Inputs
 from edqn_jax.fly.machine import Phase
-from edqn_jax.fly.pilot import PATIENCE_S, TICK_S
+from edqn_jax.fly.pilot import LATE_S, PATIENCE_S, TICK_S
 from edqn_jax.fly.records import EVENTS, RECORDS, FlightLog, inputs_of, read_records, settings_of
 from edqn_jax.fly.replay import replay
 from edqn_jax.fly.streams import EVENT, read_stream
@@ -56,43 +56,50 @@ def test_a_log_is_played_again_with_the_same_outputs_and_moves(tmp_path: Path) -
 
 
 class Packets(Camera):
-    """A camera that sends a packet each 7 ms, until it ends."""
+    """A camera that sends a packet now and then, until it ends."""
 
-    def __init__(self, time: Time, ends_at: float = np.inf) -> None:
+    def __init__(self, time: Time, every_s: float, ends_at: float = np.inf) -> None:
         super().__init__()
-        self._time, self._ends, self._sent = time, ends_at, -1
+        self._time, self._every_s, self._ends, self._sent = time, every_s, ends_at, -1
 
     def read(self, now: float, least_us: int = -1) -> None:
-        while (self._sent + 1) * PACKET_S <= min(now, self._ends) + 1e-9:
+        while (self._sent + 1) * self._every_s <= min(now, self._ends) + 1e-9:
             self._sent += 1
             events = np.zeros(1000, EVENT)
-            until = round(1e6 * self.shows(self._sent * PACKET_S))
+            until = round(1e6 * self.shows(self._sent * self._every_s))
             events["t"], events["p"] = until - 1, 1
             self.events.add(events, until, now)
 
     def wait(self, most_s: float) -> None:
-        following = (self._sent + 1) * PACKET_S if self._time.moment < self._ends else np.inf
+        following = (self._sent + 1) * self._every_s if self._time.moment < self._ends else np.inf
         self._time.moment = min(self._time.moment + most_s, following)
 
 
-PACKET_S = 0.007
-
-
-def test_a_decision_begins_with_a_packet_that_is_new_and_waits_for_none_that_does_not_come() -> None:
-    time = Time()
+@pytest.mark.parametrize(("every_s", "oldest_s"), [(0.007, 0.0), (0.02, 0.02 - PATIENCE_S), (0.033, 0.033 - PATIENCE_S)])
+def test_a_decision_waits_for_a_packet_that_is_to_come_soon(every_s: float, oldest_s: float) -> None:
+    time, ages = Time(), []
     time.passes = True
-    pilot, wire = make(camera=Packets(time), clock=time)
+
+    class Ages(Policy):
+        def decide(self, packet: np.ndarray, until_us: int, **own: Any) -> Command:
+            ages.append(time.moment + 7.0 - 1e-6 * until_us)  # by the camera's clock
+            return super().decide(packet, until_us, **own)
+
+    pilot, _ = make(Ages(), camera=Packets(time, every_s), clock=time)
     report = pilot.fly()
-    assert report.outcome == "goal" and len(report.latency.age) > 10
-    # Setpoints come each 20 ms, packets each 7: without waiting, the newest is 3 ms old in the mean. The first decision
-    # does not wait: it is made as soon as the vehicle is in offboard mode.
-    assert max(report.latency.age[1:]) < 0.01
+    assert report.outcome == "goal" and len(ages) > 10
+    # The first decision does not wait: it is made as soon as the vehicle is in offboard mode.
+    assert max(ages[1:]) <= oldest_s + 1e-5
+    np.testing.assert_allclose(report.latency.age[1:], 1e3 * np.array(ages[1:]), atol=0.01)
+
+
+def test_a_camera_that_ends_is_waited_for_no_longer_than_its_next_packet_is_late() -> None:
     time = Time()
     time.passes = True
-    pilot, wire = make(camera=Packets(time, ends_at=time.now() + 1.0), clock=time)
+    pilot, wire = make(camera=Packets(time, 0.007, ends_at=time.now() + 1.0), clock=time)
     pilot.fly()
     gaps = np.diff([now for now, velocity, _ in wire.sent if velocity is not None])
-    assert pilot.state.fault is Fault.NO_EVENTS and gaps.max() < TICK_S + PATIENCE_S + 0.004 + 1e-6
+    assert pilot.state.fault is Fault.NO_EVENTS and gaps.max() < TICK_S + PATIENCE_S + LATE_S + 0.004 + 1e-6
 
 
 LENS = Lens((64, 48), (60.0, 60.0, 32.0, 24.0), "radtan", (-0.1, 0.0, 0.0, 0.0))
