@@ -21,7 +21,11 @@ as E-DQN did while it was such an agent."""
 
 
 def supported_config(config: Config) -> Config:
-    """Returns the configuration with `AGENT` in place of what is E-DQN's default; what was set otherwise stays."""
+    """Returns the configuration with `AGENT` in place of what is E-DQN's default; what was set otherwise stays.
+
+    Products are in float32 on every processor, as the other stack's are.
+    """
     default = AgentConfig()
     changes = {name: value for name, value in AGENT.items() if getattr(config.agent, name) == getattr(default, name)}
-    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, **changes))
+    train = dataclasses.replace(config.train, products="float32")
+    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, **changes), train=train)

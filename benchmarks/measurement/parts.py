@@ -310,37 +310,44 @@ def replaying(now: Moment) -> Part:
 def vae_updating(now: Moment) -> Part:
     """Returns the part of a VAE update with drawing its batch."""
 
-    def body(rings: Samples, carry):
+    def body(config: Config, rings: Samples, carry):
         learner, keys = carry
         keys = _next(keys)
-        _, learner = updates.update_vae(now.config, AXIS, learner, rings, keys, now.state.step)
+        _, learner = updates.update_vae(config, AXIS, learner, rings, keys, now.state.step)
         return learner, keys
 
     rings, carry = now.actors.samples, (now.learner, now.shard_keys)
     each = size_of(jax.tree.map(lambda leaf: leaf[0, 0, 0], rings))
     moved = now.config.encoder.batch_size * each
-    return Part("vae_update", body, rings, carry, _LEARNER_AND_KEYS, products=True, moved=moved)
+    timed, counted = partial(body, now.config), partial(body, _in_float32(now.config))
+    return Part("vae_update", timed, rings, carry, _LEARNER_AND_KEYS, counted=counted, products=True, moved=moved)
 
 
 def learning(now: Moment) -> Part:
     """Returns the part of a training step's DQN updates with their sampling."""
 
-    def body(ring: replay.Rows, carry):
+    def body(config: Config, ring: replay.Rows, carry):
         agent, keys = carry
         keys = _next(keys)
-        _, agent = learner_of(now.config).update(now.config, AXIS, agent, Rings(ring, now.newest, keys), 0.0)
+        _, agent = learner_of(config).update(config, AXIS, agent, Rings(ring, now.newest, keys), 0.0)
         return agent, keys
 
     return Part(
         "dqn_update_and_sampling",
-        body,
+        partial(body, now.config),
         now.actors.replay,
         (now.learner.agent, now.shard_keys),
         _LEARNER_AND_KEYS,
         scans=now.config.agent.updates_per_step,
+        counted=partial(body, _in_float32(now.config)),
         products=True,
         moved=now.sampled,
     )
+
+
+def _in_float32(config: Config) -> Config:
+    """Returns the configuration with products whose operations XLA can count."""
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, products="float32"))
 
 
 def _next(keys: Array) -> Array:

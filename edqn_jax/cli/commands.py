@@ -75,6 +75,7 @@ def run_command(argv: Sequence[str], stops: Stops) -> int:
 
     0 is done, 1 a check failed, 2 bad input, 3 diverged, 130 stopped by SIGINT, and 143 by SIGTERM.
     """
+    IMPORTED.clear()
     return _exit_code_of(list(argv), stops)
 
 
@@ -163,7 +164,8 @@ def import_module_or_file(name: str) -> None:
     from edqn_jax.devices.forks import has_found_devices
 
     load_module(name)
-    IMPORTED.append(name)
+    if name not in IMPORTED:
+        IMPORTED.append(name)
     if has_found_devices():
         raise ConfigError(
             f"'{name}' computes with JAX while it is imported, before the devices are known; make its arrays within "

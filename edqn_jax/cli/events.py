@@ -171,7 +171,7 @@ def recording_figures(recording: Recording) -> dict[str, Any]:
         "left_out": recording.left_out,
         "longest_pause_s": recording.longest_pause_s,
         "contrast": recording.contrast,
-        "pictures": 0 if recording.pictures is None else len(recording.pictures.images),
+        "pictures": 0 if recording.pictures is None else len(recording.pictures.until_us),
         "has_flight": recording.flight is not None,
     }
 

@@ -201,7 +201,7 @@ class Pilot:
             self._tell(f"{now:.2f} s: {self.state.phase}" + (f" ({why})" if (why := self._why()) else ""))
 
     def _await_packet(self) -> tuple[float, float]:
-        """Reads until the camera's next packet is there, if it is to come soon; returns when it came, on both clocks."""
+        """Reads until the camera's next packet is there, if it is to come soon; returns when, on both clocks."""
         events = self.source.events
         awoke, now = time.perf_counter(), self.clock.now()
         known, expected = events.until_us, events.next_at()

@@ -1,7 +1,7 @@
 /* Products of matrices in bfloat16 with sums in float32, for CPUs with AMX: handlers of XLA's foreign function
  * interface (`products.py` registers them).
  *
- * Factors come in float32 and are rounded to the nearest bfloat16, ties to even. Both are laid out in tiles of 1 KB, as
+ * Factors come in float32 and are rounded to the nearest bfloat16, ties to even. Both are packed in tiles of 1 KB, as
  * AMX wants them: of the left factor 16 rows of 32 numbers, of the right one 16 columns of 32 numbers in pairs.
  */
 
@@ -22,7 +22,7 @@
 #define TILE 512   /* bfloat16 numbers in a tile */
 #define ROWS 16    /* of the left factor's tile, and columns of the right one's */
 #define DEPTH 32   /* of both: the sum runs over these */
-#define BLOCK 1024 /* numbers that are summed before the next are laid out, a multiple of DEPTH */
+#define BLOCK 1024 /* numbers that are summed before the next are packed, a multiple of DEPTH */
 
 #define WITH_AVX512 __attribute__((target("avx512f,avx512bw,avx512vl,avx512dq,avx512bf16")))
 #define WITH_AMX __attribute__((target("avx512f,avx512bw,avx512vl,avx512dq,avx512bf16,amx-tile,amx-bf16")))
@@ -46,8 +46,8 @@ static const char* find_fault(void) {
   return syscall(SYS_arch_prctl, 0x1023, 18) == 0 ? 0 : "the system does not give this process AMX";
 }
 
-/* Turns 16 rows of 16 numbers of 32 bits. */
-WITH_AVX512 static inline void turn(__m512i r[16]) {
+/* Transposes 16 rows of 16 numbers of 32 bits. */
+WITH_AVX512 static inline void transpose(__m512i r[16]) {
   __m512i t[16];
   for (int i = 0; i < 16; i += 2) {
     t[i] = _mm512_unpacklo_epi32(r[i], r[i + 1]);
@@ -71,9 +71,9 @@ WITH_AVX512 static inline void turn(__m512i r[16]) {
   }
 }
 
-/* Lays out one tile: pairs of the sum's numbers stand side by side; in rows of `across` where `by_row`, as the left
+/* Packs one tile: pairs of the sum's numbers stand side by side; in rows of `across` where `by_row`, as the left
  * factor's, else of pairs, as the right one's. What lies beyond the factor is 0. */
-WITH_AVX512 static inline void lay_out(uint16_t* to, const Factor* from, int64_t across, int64_t along, int by_row) {
+WITH_AVX512 static inline void pack(uint16_t* to, const Factor* from, int64_t across, int64_t along, int by_row) {
   const int64_t wide = from->across - across < ROWS ? from->across - across : ROWS;
   const int64_t deep = from->along - along < DEPTH ? from->along - along : DEPTH;
   const int64_t stride = from->along_first ? from->across : from->along;
@@ -103,12 +103,12 @@ WITH_AVX512 static inline void lay_out(uint16_t* to, const Factor* from, int64_t
       }
     }
   }
-  if (from->along_first == by_row) turn(lines);
+  if (from->along_first == by_row) transpose(lines);
   for (int i = 0; i < 16; ++i) _mm512_store_si512(to + 32 * i, lines[i]);
 }
 
 /* Adds 16 rows of 16 numbers to what stands there, or writes them where the sum begins; `high` and `wide` are in it. */
-WITH_AVX512 static inline void put(float* to, int64_t stride, const float* found, int64_t high, int64_t wide, int begins) {
+WITH_AVX512 static inline void store(float* to, int64_t stride, const float* found, int64_t high, int64_t wide, int begins) {
   const __mmask16 some = (__mmask16)(wide >= 16 ? 0xffffu : (1u << wide) - 1u);
   for (int i = 0; i < 16 && i < high; ++i) {
     __m512 row = _mm512_load_ps(found + 16 * i);
@@ -155,7 +155,7 @@ static const Layout layout = {.palette = 1,
 WITH_AMX static void multiply(const Factor* left, const Factor* right, float* to, uint16_t* scratch) {
   const int64_t columns = (right->across + ROWS - 1) / ROWS, pairs = (columns + 1) / 2;
   uint16_t* const rows = scratch; /* of two tiles of rows, then all of the right factor's */
-  uint16_t* const laid = scratch + 2 * BLOCK / DEPTH * TILE;
+  uint16_t* const packed = scratch + 2 * BLOCK / DEPTH * TILE;
   float found[1024] __attribute__((aligned(64)));
   _tile_loadconfig(&layout);
   for (int64_t from = 0; from < left->along; from += BLOCK) {
@@ -163,21 +163,21 @@ WITH_AMX static void multiply(const Factor* left, const Factor* right, float* to
     const int64_t depth = (end - from + DEPTH - 1) / DEPTH;
     for (int64_t j = 0; j < columns; ++j)
       for (int64_t k = 0; k < depth; ++k)
-        lay_out(laid + (j * depth + k) * TILE, right, j * ROWS, from + k * DEPTH, 0);
-    if (columns & 1) memset(laid + columns * depth * TILE, 0, depth * TILE * sizeof(uint16_t));
+        pack(packed + (j * depth + k) * TILE, right, j * ROWS, from + k * DEPTH, 0);
+    if (columns & 1) memset(packed + columns * depth * TILE, 0, depth * TILE * sizeof(uint16_t));
     for (int64_t i = 0; i < left->across; i += 2 * ROWS) {
       const int second = i + ROWS < left->across;
       for (int64_t k = 0; k < depth; ++k) {
-        lay_out(rows + k * TILE, left, i, from + k * DEPTH, 1);
-        if (second) lay_out(rows + (depth + k) * TILE, left, i + ROWS, from + k * DEPTH, 1);
+        pack(rows + k * TILE, left, i, from + k * DEPTH, 1);
+        if (second) pack(rows + (depth + k) * TILE, left, i + ROWS, from + k * DEPTH, 1);
       }
       for (int64_t j = 0; j < pairs; ++j) {
-        const uint16_t* pair = laid + 2 * j * depth * TILE;
+        const uint16_t* pair = packed + 2 * j * depth * TILE;
         multiply_tiles(found, rows, pair, depth, second ? depth * TILE : 0, depth * TILE);
         for (int t = 0; t < 4; ++t) {
           const int64_t down = i + (t >> 1) * ROWS, across = (2 * j + (t & 1)) * ROWS;
           if (down < left->across && across < right->across)
-            put(to + down * right->across + across, right->across, found + 256 * t, left->across - down,
+            store(to + down * right->across + across, right->across, found + 256 * t, left->across - down,
                 right->across - across, from == 0);
         }
       }
@@ -226,6 +226,8 @@ static XLA_FFI_Error* product(XLA_FFI_CallFrame* call, int left_along_first, int
   if (asked_for_version(call)) return 0;
   const XLA_FFI_Buffer *a = call->args.args[0], *b = call->args.args[1], *to = call->rets.rets[0];
   const Factor left = factor_of(a, left_along_first), right = factor_of(b, right_along_first);
+  if (a->dtype != XLA_FFI_DataType_F32 || b->dtype != XLA_FFI_DataType_F32 || to->dtype != XLA_FFI_DataType_F32)
+    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "products.c multiplies float32 alone");
   int64_t many = 1;
   for (int64_t i = 0; i < to->rank - 2; ++i) many *= to->dims[i];
   if (!multiply_all(&left, &right, to->data, many))
@@ -236,10 +238,10 @@ static XLA_FFI_Error* product(XLA_FFI_CallFrame* call, int left_along_first, int
 /* [..., M, K] times [..., K, N]. */
 XLA_FFI_Error* edqn_product(XLA_FFI_CallFrame* call) { return product(call, 0, 1); }
 
-/* [..., M, N] times [..., K, N] turned: the gradient of the rows. */
-XLA_FFI_Error* edqn_product_by_turned(XLA_FFI_CallFrame* call) { return product(call, 0, 0); }
+/* [..., M, N] times [..., K, N] transposed: the gradient of the rows. */
+XLA_FFI_Error* edqn_product_nt(XLA_FFI_CallFrame* call) { return product(call, 0, 0); }
 
-/* [..., M, K] turned times [..., M, N]: the gradient of the kernel. */
-XLA_FFI_Error* edqn_product_of_turned(XLA_FFI_CallFrame* call) { return product(call, 1, 1); }
+/* [..., M, K] transposed times [..., M, N]: the gradient of the kernel. */
+XLA_FFI_Error* edqn_product_tn(XLA_FFI_CallFrame* call) { return product(call, 1, 1); }
 
 #endif

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import functools
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from edqn_jax.native.shipped import processor_flags
 
 SOURCE = Path(__file__).with_suffix(".c")
 
-TARGETS = ("edqn_product", "edqn_product_by_turned", "edqn_product_of_turned")
+TARGETS = ("edqn_product", "edqn_product_nt", "edqn_product_tn")
 
 LEAST_SIDE = 16
 """Rows, columns and depth that a product has at least for it to be taken in bfloat16: narrower ones wait for memory."""
@@ -53,14 +54,17 @@ def are_rounded() -> bool:
 
 def is_available() -> bool:
     """Returns whether this process's CPU, its default backend, multiplies by `products.c`."""
-    if jax.default_backend() != "cpu" or not {"amx_bf16", "amx_tile", "avx512_bf16"} <= processor_flags():
-        return False
-    return ensure_registered(SOURCE, TARGETS)
+    return jax.default_backend() == "cpu" and _has_amx() and ensure_registered(SOURCE, TARGETS)
+
+
+@functools.cache
+def _has_amx() -> bool:
+    return {"amx_bf16", "amx_tile", "avx512_bf16"} <= processor_flags()
 
 
 @jax.custom_vjp
 def rounded_matmul(x: Array, kernel: Array) -> Array:
-    """Returns `x @ kernel`, `[..., F]`, of rows `[..., K]` and a kernel `[K, F]`, with both rounded to bfloat16."""
+    """Returns `x @ kernel`, `[..., F]`, of rows `[..., K]` and a kernel `[K, F]`, both rounded to bfloat16."""
     return _multiply(x.reshape(-1, x.shape[-1]), kernel).reshape(*x.shape[:-1], kernel.shape[-1])
 
 
@@ -71,21 +75,22 @@ def _product(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
 def _product_gradient(kept: tuple[Array, Array], change: Array) -> tuple[Array, Array]:
     x, kernel = kept
     rows, changes = x.reshape(-1, x.shape[-1]), change.reshape(-1, change.shape[-1])
-    return _multiply(changes, kernel, turn_right=True).reshape(x.shape), _multiply(rows, changes, turn_left=True)
+    of_rows = _multiply(changes, kernel, transpose_right=True)
+    return of_rows.reshape(x.shape), _multiply(rows, changes, transpose_left=True)
 
 
 rounded_matmul.defvjp(_product, _product_gradient)
 
 
-def _multiply(left: Array, right: Array, *, turn_left: bool = False, turn_right: bool = False) -> Array:
-    """Returns the product [M, N] of two matrices, of which one may be turned."""
-    rows, depth = left.shape[::-1] if turn_left else left.shape
-    columns = right.shape[0 if turn_right else 1]
-    if min(rows, depth, columns) < LEAST_SIDE:
-        return jnp.matmul(left.T if turn_left else left, right.T if turn_right else right)
+def _multiply(left: Array, right: Array, *, transpose_left: bool = False, transpose_right: bool = False) -> Array:
+    """Returns the product [M, N] of two matrices, of which one may be transposed."""
+    rows, depth = left.shape[::-1] if transpose_left else left.shape
+    columns = right.shape[0 if transpose_right else 1]
+    if min(rows, depth, columns) < LEAST_SIDE or not left.dtype == right.dtype == jnp.float32:
+        return jnp.matmul(left.T if transpose_left else left, right.T if transpose_right else right)
     if not is_available():
         left, right = (lax.reduce_precision(x, exponent_bits=8, mantissa_bits=7) for x in (left, right))
-        return jnp.matmul(left.T if turn_left else left, right.T if turn_right else right)
-    target = TARGETS[2 if turn_left else 1 if turn_right else 0]
+        return jnp.matmul(left.T if transpose_left else left, right.T if transpose_right else right)
+    target = TARGETS[2 if transpose_left else 1 if transpose_right else 0]
     shape = jax.ShapeDtypeStruct((rows, columns), jnp.float32)
     return jax.ffi.ffi_call(target, shape, vmap_method="broadcast_all")(left, right)

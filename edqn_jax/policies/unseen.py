@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from edqn_jax.config import Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.sim.scene.scene import Scene
 
 MANY_LOOKS, ONE_LOOK = "drawn", "plaid"
@@ -25,7 +25,7 @@ def describe_unseen(trained: Config, flown: Config, scene: Scene | None = None) 
         found.append(
             f"this policy was trained with surface.pattern {known} alone; with {met} it sees what it never learnt"
         )
-    elif known == ONE_LOOK and scene is not None and _has_patterns(scene):
+    elif known == ONE_LOOK and trained.world.name in FAMILIES and scene is not None and _has_patterns(scene):
         found.append(
             f"this policy was trained with surface.pattern {known} alone; the shapes of this world have patterns of "
             "their own: it sees what it never learnt"

@@ -68,6 +68,8 @@ class Progress:
         self._started = self._phase_started if began is None else began
         self._printed = self._phase_started - every_s
         self._updated: tuple[float, int] | None = None  # when, and after how many decisions
+        self._paused_s = self._all_paused_s = self._all_trained_s = 0.0  # validations since then, all, and training
+        self._share = 0.0  # of validations in training's time, after the last of them
         self._measured_s, self._measured = 0.0, 0.0  # seconds and decisions that the rate is made of
 
     @property
@@ -78,6 +80,8 @@ class Progress:
     def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
         """Shows that the phase `name` begins; if it is training, with the decisions in all and those taken before."""
         returning = total == 0 and name == "training"  # from a validation
+        if returning:
+            self._paused_s += time.monotonic() - self._phase_started
         self._tell(name)
         self._phase, self._phase_started, self._counted = name, time.monotonic(), (0, 0)
         self._total = total or self._total
@@ -134,20 +138,25 @@ class Progress:
     def _measure(self, now: float) -> None:
         """Adds the newest decisions to the rate, unless the VAE was trained, too: then they take much longer."""
         if self._updated is not None and self._phase not in ("warm-up", "retraining"):
-            took = now - self._updated[0]
+            took = max(now - self._updated[0] - self._paused_s, 0.0)
+            if self._paused_s and self._all_trained_s:
+                self._all_paused_s += self._paused_s
+                self._share = self._all_paused_s / self._all_trained_s
+            self._all_trained_s += took
             kept = 0.5 ** (took / FORGOTTEN_S)
             self._measured_s = kept * self._measured_s + took
             self._measured = kept * self._measured + self._decisions() - self._updated[1]
-        self._updated = (now, self._decisions())
+        self._updated, self._paused_s = (now, self._decisions()), 0.0
 
     def _remaining(self) -> str:
-        """Returns the time that the rest of training takes at the rate of late, validations included, as text.
+        """Returns the time that the rest of training takes at the rate of late, with its share of validations, as text.
 
         Nothing is known in the warm-up, and a retraining of the VAE that is still to come is not in it.
         """
         if self._measured <= 0:
             return "–"
         left = max(self._total - self._decisions(), 0) * self._measured_s / self._measured
+        left *= 1.0 + self._share
         return format_duration(max(left - (time.monotonic() - (self._updated or (0.0, 0))[0]), 0.0))
 
     def _values(self) -> list[tuple[str, str]]:

@@ -75,7 +75,9 @@ class Packets(Camera):
         self._time.moment = min(self._time.moment + most_s, following)
 
 
-@pytest.mark.parametrize(("every_s", "oldest_s"), [(0.007, 0.0), (0.02, 0.02 - PATIENCE_S), (0.033, 0.033 - PATIENCE_S)])
+@pytest.mark.parametrize(
+    ("every_s", "oldest_s"), [(0.007, 0.0), (0.02, 0.02 - PATIENCE_S), (0.033, 0.033 - PATIENCE_S)]
+)
 def test_a_decision_waits_for_a_packet_that_is_to_come_soon(every_s: float, oldest_s: float) -> None:
     time, ages = Time(), []
     time.passes = True

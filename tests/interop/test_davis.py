@@ -42,7 +42,7 @@ def test_pictures_are_read_with_the_ends_of_their_exposures(tmp_path: Path) -> N
     pictures = recording.pictures
     assert len(recording.events) == 3000 and recording.size() == SIZE and pictures is not None
     assert pictures.until_us.tolist() == [each + EXPOSURE_US for each in began]
-    np.testing.assert_array_equal(np.stack(pictures.images), np.stack(images))
+    np.testing.assert_array_equal(np.stack([pictures.image(number) for number in range(3)]), np.stack(images))
     newest = {1_000_000: 0, 1_044_999: 0, 1_045_000: 1, 2_000_000: 2}  # none before: the first is shown
     for moment, number in newest.items():
         np.testing.assert_array_equal(pictures.newest(moment), images[number])
@@ -54,7 +54,13 @@ def test_colours_become_grey_by_the_papers_weights(tmp_path: Path) -> None:
     pictures = read_events(written(tmp_path / "a.aedat4", [blue_green_red], [1_000_000])).pictures
     assert pictures is not None
     blue, green, red = np.moveaxis(blue_green_red.astype(float), -1, 0)
-    np.testing.assert_allclose(pictures.images[0], 0.299 * red + 0.587 * green + 0.114 * blue, atol=0.501)
+    np.testing.assert_allclose(pictures.image(0), 0.299 * red + 0.587 * green + 0.114 * blue, atol=0.501)
+
+
+def test_pictures_of_other_numbers_than_bytes_are_left_out_and_events_are_not(tmp_path: Path) -> None:
+    deep = np.zeros((HEIGHT, WIDTH), np.uint16)
+    recording = read_events(written(tmp_path / "a.aedat4", [deep], [1_000_000]))
+    assert len(recording.events) == 3000 and recording.pictures is None
 
 
 def test_they_stand_beside_what_a_policy_makes_of_the_events(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

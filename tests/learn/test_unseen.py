@@ -51,3 +51,5 @@ def test_a_world_with_patterns_of_its_own_is_unseen_by_a_policy_of_one_look(tmp_
     (line,) = describe_unseen(TRAINED, TRAINED, load_scene(striped))
     assert "trained with surface.pattern plaid alone; the shapes of this world have patterns of their own" in line
     assert describe_unseen(MANY, MANY, load_scene(striped)) == []
+    there = make_config(str(striped), surface={"pattern": "plaid"})
+    assert describe_unseen(there, there, load_scene(striped)) == []  # it learnt there

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ from edqn_jax.config import AgentConfig
 from edqn_jax.learn.perception.layers import matmul
 from edqn_jax.learn.qnetwork import init_q, q_values
 from edqn_jax.native.products import LEAST_SIDE, are_rounded, in_precision, is_available, rounded_matmul
+from edqn_jax.native.shipped import processor_flags
 from tests.oracles.rounded_products import product, to_bfloat16
 
 SHAPES = [(32, 32, 32), (33, 47, 65), (64, 1024, 32), (48, 1025, 49), (257, 96, 112), (32, 2500, 80)]
@@ -33,8 +35,8 @@ def assert_close(found: Any, left: Any, right: Any) -> None:
 def test_products_and_their_gradients_are_those_of_rounded_factors(rows: int, depth: int, columns: int) -> None:
     x, kernel = numbers(0, rows, depth), numbers(1, depth, columns)
     change = numbers(2, rows, columns)
-    found, turned_back = jax.vjp(jax.jit(rounded_matmul), x, kernel)
-    of_rows, of_kernel = turned_back(change)
+    found, gradient = jax.vjp(jax.jit(rounded_matmul), x, kernel)
+    of_rows, of_kernel = gradient(change)
     assert_close(found, x, kernel)
     assert_close(of_rows, change, kernel.T)
     assert_close(of_kernel, x.T, change)
@@ -55,6 +57,18 @@ def test_narrow_products_are_not_rounded() -> None:
     for rows, depth, columns in ((narrow, 64, 64), (64, narrow, 64), (64, 64, narrow)):
         x, kernel = numbers(0, rows, depth), numbers(1, depth, columns)
         np.testing.assert_allclose(rounded_matmul(x, kernel), x @ kernel, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.int32])
+def test_numbers_of_other_types_are_multiplied_as_they_are(dtype: Any) -> None:
+    x = jnp.ones((32, 32), dtype)
+    np.testing.assert_array_equal(np.asarray(rounded_matmul(x, x), np.float32), np.full((32, 32), 32.0))
+
+
+def test_where_the_processor_has_amx_and_there_is_a_compiler_it_is_used() -> None:
+    has = {"amx_bf16", "amx_tile", "avx512_bf16"} <= processor_flags() and shutil.which("cc") is not None
+    text = jax.jit(rounded_matmul).lower(jnp.ones((32, 32)), jnp.ones((32, 32))).as_text()
+    assert ("edqn_product" in text) is is_available() is has
 
 
 def test_what_is_not_finite_stays_so() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -117,6 +118,28 @@ def test_the_estimate_follows_a_machine_that_becomes_slower(monkeypatch):
     minutes, seconds = line.split("training left ")[1].split(":")
     assert 85 <= 60 * int(minutes) + int(seconds) <= 100
     assert line.startswith("[6:20]")  # 360 s, and the 20 before
+
+
+def test_the_estimate_does_not_jump_after_a_validation(monkeypatch):
+    """Ten decisions a second, and a validation of 60 s after each 300: a fifth of the time is validating."""
+    now, out = [0.0], io.StringIO()
+    monkeypatch.setattr("edqn_jax.report.progress.time.monotonic", lambda: now[0])
+    progress = Progress(Console(file=out, width=200), every_s=0.0)
+    progress.phase("training", total=30_000)
+    estimates = []
+    for decisions in range(50, 12_050, 50):
+        now[0] += 5.0
+        progress.update({"phase": "training", "decisions": decisions})
+        minutes, seconds = out.getvalue().splitlines()[-1].split("training left ")[1].split(":")
+        estimates.append(60 * int(minutes) + int(seconds))
+        if decisions % 3000 == 0:
+            progress.phase("validating")
+            now[0] += 60.0
+            progress.phase("training")
+    after = np.array(estimates[60:])  # the first validation is over
+    changes = np.diff(after)
+    assert np.all((changes <= 70) & (changes >= -20))
+    assert after[-1] == pytest.approx((30_000 - 12_000) / 10 * 1.2, rel=0.06)
 
 
 def test_stopping_what_never_started_is_harmless():

@@ -74,11 +74,12 @@ def read_aedat4(file: Path, size: tuple[int, int] | None = None, number: int | N
         decompress = _decompressor(file, compression)
         packets = [_events(decompress(packet)) for packet in _packets(content, begin, end, stream.number)]
         taken = [
-            _picture(decompress(packet))
+            packet
             for each in streams
             if each.kind == PICTURES and each.source == stream.source
             for packet in _packets(content, begin, end, each.number)
         ]
+        pictures = _pictures_of(taken, decompress)
     except (struct.error, ValueError, ElementTree.ParseError, RuntimeError, MemoryError, KeyError) as error:
         if isinstance(error, ConfigError):
             raise
@@ -93,14 +94,18 @@ def read_aedat4(file: Path, size: tuple[int, int] | None = None, number: int | N
         size=stream.size or size,
         time_unit="us",
         says_unit="us, as AEDAT4 has it",
-        pictures=_in_order(taken),
+        pictures=pictures,
     )
 
 
-def _in_order(taken: list[tuple[int, NDArray[np.uint8]]]) -> Pictures | None:
-    """Returns pictures in the order of their times; None where there are none."""
-    taken = sorted(taken, key=lambda each: each[0])
-    return Pictures(np.array([until for until, _ in taken], np.int64), [each for _, each in taken]) if taken else None
+def _pictures_of(packets: list[bytes], decompress: Callable[[bytes], bytes]) -> Pictures | None:
+    """Returns pictures of 8 bits in the order of their times, unpacked when they are asked for; None without any."""
+    ends = {number: _end_of_exposure(decompress(packet)) for number, packet in enumerate(packets)}
+    known = sorted((end, number) for number, end in ends.items() if end is not None)
+    if not known:
+        return None
+    times = np.array([end for end, _ in known], np.int64)
+    return Pictures(times, lambda place: _picture(decompress(packets[known[place][1]])))
 
 
 def _header(content: bytes) -> tuple[int, int, list[Stream], int]:
@@ -205,24 +210,29 @@ def _events(packet: bytes) -> NDArray:
     return np.frombuffer(packet, EVENT, number, vector + 4)
 
 
-def _picture(packet: bytes) -> tuple[int, NDArray[np.uint8]]:
-    """Returns the end of the exposure, µs, and the picture [H, W] of an unpacked packet.
+def _end_of_exposure(packet: bytes) -> int | None:
+    """Returns the end of the exposure, µs, of an unpacked packet's picture; None of one that is not of 8 bits.
 
     Raises:
-        ValueError: if it holds no picture, or one that is not of 8 bits.
+        ValueError: if it holds no picture.
     """
     root = 4 + struct.unpack_from("<I", packet, 4)[0]
     if packet[8:12] != b"FRME":
         raise ValueError("a packet of its stream of pictures holds something else")
-    time, end = _field(packet, root, 0, "<q", 0), _field(packet, root, 4, "<q", 0)
+    if _field(packet, root, 5, "<b", 0) not in CHANNELS:
+        return None
+    return _field(packet, root, 4, "<q", 0) or _field(packet, root, 0, "<q", 0)
+
+
+def _picture(packet: bytes) -> NDArray[np.uint8]:
+    """Returns the picture [H, W] of an unpacked packet, one of 8 bits."""
+    root = 4 + struct.unpack_from("<I", packet, 4)[0]
     form, width, height = (_field(packet, root, *each, 0) for each in ((5, "<b"), (6, "<h"), (7, "<h")))
-    if form not in CHANNELS:
-        raise ValueError(f"its pictures are of a format, {form}, that is not read")
     vector = root + _offset(packet, root, 10)
     vector += struct.unpack_from("<I", packet, vector)[0]
     size = height, width, CHANNELS[form]
     pixels = np.frombuffer(packet, np.uint8, height * width * size[2], vector + 4).reshape(size)
-    return end or time, pixels[..., 0] if form == 0 else np.rint(pixels[..., :3] @ BGR).astype(np.uint8)
+    return pixels[..., 0] if form == 0 else np.rint(pixels[..., :3] @ BGR).astype(np.uint8)
 
 
 def _offset(buffer: bytes, table: int, field: int) -> int:

@@ -8,7 +8,7 @@ plausible; otherwise it is refused with a sentence that names the option to give
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -56,12 +56,12 @@ class Pictures:
 
     until_us: NDArray[np.int64]
     """[P] end of each exposure, on the events' clock, in order."""
-    images: Sequence[NDArray[np.uint8]]
-    """P of [H, W], grey."""
+    image: Callable[[int], NDArray[np.uint8]]
+    """Returns the picture [H, W] of a number, grey."""
 
     def newest(self, end_us: int) -> NDArray[np.uint8]:
         """Returns the last picture [H, W] that was taken by a moment; before there is one, the first."""
-        return self.images[max(int(np.searchsorted(self.until_us, end_us, side="right")) - 1, 0)]
+        return self.image(max(int(np.searchsorted(self.until_us, end_us, side="right")) - 1, 0))
 
 
 @dataclasses.dataclass(frozen=True)
