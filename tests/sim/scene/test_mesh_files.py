@@ -183,12 +183,3 @@ def test_a_text_with_its_meshes_may_not_be_too_large(tmp_path: Path, monkeypatch
     monkeypatch.setattr("edqn_jax.sim.scene.mjcf_parts.files.MAX_BYTES", 2000)
     with pytest.raises(SceneError, match="with the files that it names; a world may have 2,000"):
         load_world(file)
-
-
-def test_an_ellipsoid_that_moves_is_refused(tmp_path: Path) -> None:
-    geom = '<body name="b" mocap="true" pos="9 5 3"><geom name="egg" type="ellipsoid" size="1 .5 .5"/></body>'
-    file = world(tmp_path, "", geom)
-    moves = '<custom><text name="motion:b" data="oscillate 0 1 0 4 0"/></custom></mujoco>'
-    file.write_text(file.read_text().replace("</mujoco>", moves))
-    with pytest.raises(SceneError, match="geom 'egg' is of the kind ellipsoid on a body that moves"):
-        load_world(file)
