@@ -65,7 +65,7 @@ def test_bad_input_ends_with_exit_code_2() -> None:
 
 @pytest.mark.parametrize(
     ("script", "works"),
-    [(mission, "measure"), (tracking, "measure"), (verdicts, "load_run")],
+    [(mission, "measure"), (tracking, "measure"), (verdicts, "fly_recorded")],
     ids=["mission", "tracking", "verdicts"],
 )
 def test_a_file_that_cannot_be_written_is_named_before_anything_is_measured(
