@@ -167,7 +167,7 @@ def check_world(
     except ConfigError as error:
         return dataclasses.replace(found, refusal=str(error))
     if way is None:
-        closed = f"{placed.title} has no way from start to goal: all ways are closed, or far too narrow; open one"
+        closed = f"{placed.title} has no way from its start to its goal: all are closed, or far too narrow; open one"
         return dataclasses.replace(found, refusal=closed)
     found = dataclasses.replace(found, way=way, nearest=_nearest_shape(scene, way, placed.names or {}))
     if not way.fits:

@@ -58,7 +58,7 @@ def test_patterns_that_a_file_brings_are_warned_of_where_the_policy_knows_one_lo
 
 @pytest.mark.parametrize(
     ("door", "said"),
-    [(0.0, "is wide enough|all ways are closed"), (0.6, "at 0.30 m, closer than the drone's radius of 0.36 m")],
+    [(0.0, "is wide enough|all are closed"), (0.6, "at 0.30 m, closer than the drone's radius of 0.36 m")],
 )
 def test_a_door_that_is_closed_or_too_narrow_is_not_flown(door: float, said: str, tmp_path: Path) -> None:
     found = check_world(ROOMS, str(corridor(tmp_path, door)))
