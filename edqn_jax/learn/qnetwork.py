@@ -32,14 +32,14 @@ class QNetwork(nn.Module):
     def __call__(self, x: Array) -> Array:
         """Returns values [..., actions] of stacked observations `x` [..., history * observation]."""
         for width in self.config.hidden:
-            x = Dense(width)(x)
+            x = Dense(width, many_rows=False)(x)
             if self.config.layer_norm:
                 x = nn.LayerNorm()(x)
             x = nn.relu(x)
         if not self.config.dueling:
-            return Dense(self.actions)(x)
+            return Dense(self.actions, many_rows=False)(x)
         # Q = V + A - mean A (Wang et al. 2016, Eq. 9), both heads in one product.
-        heads = Dense(self.actions + 1)(x)
+        heads = Dense(self.actions + 1, many_rows=False)(x)
         advantage = heads[..., 1:]
         return heads[..., :1] + advantage - jnp.mean(advantage, axis=-1, keepdims=True)
 

@@ -178,7 +178,7 @@ WITH_AMX static void multiply(const Factor* left, const Factor* right, float* to
           const int64_t down = i + (t >> 1) * ROWS, across = (2 * j + (t & 1)) * ROWS;
           if (down < left->across && across < right->across)
             store(to + down * right->across + across, right->across, found + 256 * t, left->across - down,
-                right->across - across, from == 0);
+                  right->across - across, from == 0);
         }
       }
     }

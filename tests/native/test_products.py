@@ -97,4 +97,8 @@ def test_a_network_is_rounded_where_it_is_asked_for_alone() -> None:
     assert 1e-5 * size < np.abs(values("bfloat16") - plain).max() < 1e-2 * size
     np.testing.assert_array_equal(values("auto"), values("bfloat16" if is_available() else "float32"))
     assert not are_rounded()
+    # What is not trained has derivatives of any kind.
+    forward = jax.jacfwd(lambda history: q_values(config, params, 27, history))(history[0])
+    backward = jax.jacrev(lambda history: q_values(config, params, 27, history))(history[0])
+    np.testing.assert_allclose(forward, backward, atol=1e-5)
     np.testing.assert_array_equal(matmul(history[:, 0], jnp.eye(40)), history[:, 0])

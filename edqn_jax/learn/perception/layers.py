@@ -33,12 +33,17 @@ class Dense(nn.Module):
     use_bias: bool = True
     kernel_init: Callable[..., Any] = lecun_normal()
     bias_init: Callable[..., Any] = zeros
+    many_rows: bool = True
+    """Whether its gradients are written as products; else they are JAX's own, of any order."""
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
         """Returns `[..., features]` of `[..., K]`."""
-        y = matmul(x, self.param("kernel", self.kernel_init, (x.shape[-1], self.features)))
-        return add_shared(y, self.param("bias", self.bias_init, (self.features,))) if self.use_bias else y
+        y = matmul(x, self.param("kernel", self.kernel_init, (x.shape[-1], self.features)), many_rows=self.many_rows)
+        if not self.use_bias:
+            return y
+        bias = self.param("bias", self.bias_init, (self.features,))
+        return add_shared(y, bias) if self.many_rows else y + bias
 
 
 def init_params(module: Any, name: str, key: Array, **inputs: Any) -> Any:
@@ -60,9 +65,11 @@ def init_params(module: Any, name: str, key: Array, **inputs: Any) -> Any:
     return variables["params"]
 
 
-def matmul(x: Array, kernel: Array) -> Array:
+def matmul(x: Array, kernel: Array, *, many_rows: bool = True) -> Array:
     """Returns `x @ kernel`, `[..., F]`, of rows `[..., K]` and a kernel `[K, F]`, as `in_precision` has them."""
-    return rounded_matmul(x, kernel) if are_rounded() else shared_matmul(x, kernel)
+    if are_rounded():
+        return rounded_matmul(x, kernel)
+    return shared_matmul(x, kernel) if many_rows else x @ kernel
 
 
 @jax.custom_vjp
