@@ -115,6 +115,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: rank.get(item.path.stem, len(LONGEST)))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def young_process() -> Iterator[None]:
+    """Lets go of all that JAX has traced in a file once its tests are over.
+
+    JAX keeps the modules of what it has compiled, and with thousands of them lowers and traces up to twenty times as
+    slowly; what other files compile again comes from the cache on disk.
+    """
+    yield
+    jax.clear_caches()
+    gc.collect()
+
+
 @pytest.fixture
 def strict_jax() -> Iterator[None]:
     """No silent rank promotion, no key used twice, no leaked tracer; for our own functions, MJX breaks it."""

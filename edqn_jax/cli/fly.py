@@ -355,16 +355,21 @@ def simulate(args: FlyArgs) -> None:
     if args.picture == "mujoco":
         os.environ.setdefault("MUJOCO_GL", "egl")  # read as MuJoCo is imported
 
+    from edqn_jax.runs.policies import load_policy
+    from edqn_jax.sim.environment import make
+
+    assert args.simulate is not None
+    show_phase("reading policy and world")
+    policy = load_policy(args.policy)
+    make(args.simulate, policy.config, worlds=1, split="test")  # its errors come before those of packages
+
     from edqn_jax.evaluation.metrics import wilson_interval
     from edqn_jax.evaluation.world_check import warn_of_training
     from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_missions
     from edqn_jax.fly.simulated.several import fly_at_once
     from edqn_jax.interop.deployment.onnx_export import export_policy
-    from edqn_jax.runs.policies import load_policy
 
-    assert args.simulate is not None
     show_phase("exporting the policy")
-    policy = load_policy(args.policy)
     asked = args.simulate, policy.config, args.missions, args.seed
     there = replace(policy.config, world=replace(policy.config.world, name=args.simulate))
     for warning in warn_of_training(there, policy.config):

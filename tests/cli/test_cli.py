@@ -18,6 +18,7 @@ import pytest
 from edqn_jax.cli import commands, main, train
 from edqn_jax.cli.arguments import MEANINGS, flags_of
 from edqn_jax.cli.evaluate import EvaluateArgs, parse_evaluate
+from edqn_jax.cli.fly import parse_fly, simulate
 from edqn_jax.cli.help import COMMON, NAMED, flag_of
 from edqn_jax.cli.train import parse_train, train_flags
 from edqn_jax.config import Config, get_preset
@@ -336,6 +337,15 @@ def shown(*words: str) -> str:
         check=True,
         env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"},
     ).stdout
+
+
+def test_a_simulated_flights_world_is_looked_at_before_its_packages(monkeypatch):
+    monkeypatch.setitem(sys.modules, "edqn_jax.fly.simulated.missions", None)  # as where its extra is not installed
+    args = parse_fly(["pretrained-looks", "--simulate", "rums"])
+    with pytest.raises(ConfigError, match="rums"):
+        simulate(args)
+    with pytest.raises(ImportError):
+        simulate(dataclasses.replace(args, simulate="rooms"))
 
 
 def test_help_all_lists_every_option_and_does_not_start_jax():
