@@ -26,6 +26,7 @@ os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
 import jax
 import pytest
 
+from edqn_jax.devices.cache import private_folder
 from edqn_jax.devices.devices import use_cpu_devices
 
 CACHE = {
@@ -33,10 +34,7 @@ CACHE = {
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
-"""Options of JAX's compilation cache; JAX_COMPILATION_CACHE_DIR names another folder than pytest's own cache."""
-
-MOST_CACHED_BYTES = 2**30
-"""The cache of compiled programs is emptied at the start of a session when it has grown beyond this."""
+"""Options of JAX's compilation cache; JAX_COMPILATION_CACHE_DIR names another folder than the user's."""
 
 LONGEST = (
     "test_layout",
@@ -80,11 +78,11 @@ gc.set_threshold(50_000, 50, 100)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Shares compiled programs between the processes of a session, those that tests start, and the next session.
+    """Shares compiled programs between the processes of a session, those that tests start, and later sessions.
 
-    Most of a session's time is XLA's, many tests compile the same, and from one session to the next few programs
-    change. An entry's key holds the whole program, its options and XLA's flags, so a program that has changed is
-    compiled again. `pytest --cache-clear` empties the cache.
+    Much of a session's time is XLA's, many tests compile the same, and from one session or checkout to the next few
+    programs change. An entry's key holds the whole program, its options and XLA's flags, so a program that has changed
+    is compiled again. The folder is the package's own (`edqn_jax.devices.cache`), which keeps to its size.
     """
     if hasattr(config, "workerinput"):
         return  # started by a process that has done this
@@ -96,16 +94,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def _programs(config: pytest.Config) -> Path:
-    """Returns the folder of compiled programs within pytest's cache, or a temporary one where pytest has none."""
-    cache = getattr(config, "cache", None)
-    if cache is None:
-        folder = tempfile.mkdtemp(prefix="edqn-tests-")
+    """Returns the user's folder of compiled programs, or a temporary one where none can be kept."""
+    folder = private_folder()
+    if folder is None:
+        folder = Path(tempfile.mkdtemp(prefix="edqn-tests-"))
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
-        return Path(folder)
-    folder = cache.mkdir("programs")
-    if sum(file.stat().st_size for file in folder.iterdir()) > MOST_CACHED_BYTES:
-        shutil.rmtree(folder)
-        folder = cache.mkdir("programs")
     return folder
 
 
@@ -113,6 +106,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Puts the longest files first; `--no-loadscope-reorder` keeps them there."""
     rank = {name: number for number, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(LONGEST)))
+
+
+def pytest_collection_finish() -> None:
+    """Keeps what has been collected, as long as the session, out of the walks over what may be let go of."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="module")
