@@ -78,14 +78,17 @@ gc.set_threshold(50_000, 50, 100)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Shares compiled programs between the processes of a session, those that tests start, and later sessions.
+    """Leaves out tests of whole policies where no test was named, and shares compiled programs.
 
+    Processes of a session, those that tests start and later sessions share them.
     Much of a session's time is XLA's, many tests compile the same, and from one session or checkout to the next few
     programs change. An entry's key holds the whole program, its options and XLA's flags, so a program that has changed
     is compiled again. The folder is the package's own (`edqn_jax.devices.cache`), which keeps to its size.
     """
     if hasattr(config, "workerinput"):
         return  # started by a process that has done this
+    if config.args_source is config.ArgsSource.TESTPATHS and not config.option.markexpr:
+        config.option.markexpr = "not whole"
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_programs(config))
     for name, value in (CACHE | {"jax_compilation_cache_dir": folder}).items():
         # Workers and children read the variables when they import JAX; this process has imported it.

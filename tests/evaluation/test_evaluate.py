@@ -33,6 +33,8 @@ from edqn_jax.sim.task.flights import Closest, Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.policies import CONFIG, always
 
+pytestmark = pytest.mark.whole
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:

@@ -23,7 +23,7 @@ from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.policies import CONFIG, always, that_sees
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.whole]
 
 MISSIONS = 80
 DT = CONFIG.drone.physics_dt_s

@@ -32,6 +32,8 @@ from tests.support.miniature import WORLD
 from tests.support.policies import CONFIG, fresh
 from tests.support.registries import keep_as_they_are
 
+pytestmark = pytest.mark.whole
+
 BLIND = dataclasses.replace(
     CONFIG,
     env=dataclasses.replace(CONFIG.env, sensor="blind", max_decisions=20),

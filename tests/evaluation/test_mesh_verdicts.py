@@ -24,6 +24,8 @@ from tests.oracles.mesh_distance import signed_distances
 from tests.support.meshes import CUBE, hull, mesh_world
 from tests.support.policies import CONFIG, always
 
+pytestmark = pytest.mark.whole
+
 RADIUS = 0.36
 RING = trimesh.creation.torus(1.2, 0.2, major_sections=24, minor_sections=10)
 GATE = np.asarray(RING.vertices)[:, [2, 0, 1]], np.asarray(RING.faces)  # to be flown through along x

@@ -20,6 +20,8 @@ from edqn_jax.sim.scene.scene import take_scene
 from edqn_jax.sim.worlds import families
 from tests.support.small_worlds import WITHOUT_A_WAY, small_world
 
+pytestmark = pytest.mark.whole
+
 CONFIG = Config()
 
 

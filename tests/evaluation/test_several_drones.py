@@ -18,6 +18,8 @@ from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.scene.scene import PARKED, scene_at
 from edqn_jax.sim.task.outcomes import Outcome
 
+pytestmark = pytest.mark.whole
+
 DRONES = 4
 GROUPS = 3
 REACH = 2 * 0.36

@@ -20,6 +20,8 @@ from edqn_jax.learn.state import init_state
 from edqn_jax.learn.step import train_step
 from edqn_jax.sim.task.outcomes import Outcome
 
+pytestmark = pytest.mark.whole
+
 STEPS = 40
 
 

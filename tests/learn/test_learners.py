@@ -21,6 +21,8 @@ from edqn_jax.learn.state import init_state
 from edqn_jax.learn.step import policy_of, run_steps
 from tests.support.miniature import miniature_world
 
+pytestmark = pytest.mark.whole
+
 STEPS = 24
 
 

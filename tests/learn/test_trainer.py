@@ -32,6 +32,8 @@ from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.configs import TINY, retrained
 from tests.support.miniature import miniature_world
 
+pytestmark = pytest.mark.whole
+
 RETRAINED = retrained((0.01,))
 
 

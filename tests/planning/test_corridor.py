@@ -122,6 +122,7 @@ def test_a_path_is_shortened_as_astar_shortens_it():
     assert not any(leg_touches(scene, a, b, RADIUS) for a, b in zip(tight, tight[1:], strict=False))
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_in_random_worlds_it_is_at_most_2_percent_more_than_astars(asked_astar):
     keys = world_keys("test", WORLDS, 500)

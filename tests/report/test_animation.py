@@ -23,6 +23,8 @@ from edqn_jax.sim.scene.mjcf import write_scene
 from tests.support.box_flight import SMALL, Drawn, a_flight, recorded, world_with_a_box
 from tests.support.policies import always
 
+pytestmark = pytest.mark.whole
+
 
 def frames(image: Image.Image) -> int:
     return getattr(image, "n_frames", 1)

@@ -18,7 +18,7 @@ from tests.support.configs import BLIND_RUN
 CHUNK = BLIND_RUN.train.num_envs * BLIND_RUN.train.chunk_steps
 """Decisions."""
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.whole]
 
 
 def one(transition: Transition) -> jax.Array:

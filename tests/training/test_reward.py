@@ -31,6 +31,8 @@ from edqn_jax.sim.worlds import geodesic
 from edqn_jax.training.setup import config_for_reward, set_up_training
 from tests.support.configs import BLIND_RUN
 
+pytestmark = pytest.mark.whole
+
 CONFIG = dataclasses.replace(Config(), env=dataclasses.replace(Config().env, sensor="blind"))
 
 SOURCE = """

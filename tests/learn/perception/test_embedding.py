@@ -73,6 +73,7 @@ def traced(world: EnvParams) -> Callable[[str], tuple]:
     return of
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS[1:])
 def test_the_training_step_learns_from_every_sensor_mapped_over_seeds(traced, name: str) -> None:
@@ -201,6 +202,7 @@ def test_a_picture_is_pooled_pixel_by_pixel(kind) -> None:
         np.testing.assert_allclose(spread, -4.0, atol=1e-6)  # untrained
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_code_of_pictures_is_learnt() -> None:
     config, camera = EncoderConfig("pooled", "sensed"), CameraConfig()
