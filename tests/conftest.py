@@ -80,10 +80,10 @@ gc.set_threshold(50_000, 50, 100)
 def pytest_configure(config: pytest.Config) -> None:
     """Leaves out tests of whole policies where no test was named, and shares compiled programs.
 
-    Processes of a session, those that tests start and later sessions share them.
-    Much of a session's time is XLA's, many tests compile the same, and from one session or checkout to the next few
-    programs change. An entry's key holds the whole program, its options and XLA's flags, so a program that has changed
-    is compiled again. The folder is the package's own (`edqn_jax.devices.cache`), which keeps to its size.
+    They are shared by the processes of a session, those that tests start, and later sessions. Much of a session's
+    time is XLA's, many tests compile the same, and from one session or checkout to the next few programs change. An
+    entry's key holds the whole program, its options and XLA's flags, so a program that has changed is compiled again.
+    The folder is the package's own (`edqn_jax.devices.cache`), which keeps to its size.
     """
     if hasattr(config, "workerinput"):
         return  # started by a process that has done this
