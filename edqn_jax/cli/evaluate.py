@@ -63,15 +63,15 @@ def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
 
     Raises:
         ConfigError: if one is out of its limits, or there is no such run.
-        SystemExit: after printing, for --help and for arguments that do not parse.
+        SystemExit: after printing, for --help, --help-all and for arguments that do not parse.
     """
     kind = with_conditions(with_help_texts(EvaluateArgs), CONDITIONS)
     flags = {
         flag: (group, option) for group, names in CONDITIONS.items() for flag, option in flags_of_group(group, names)
     }
-    check_flags(argv, flags_of(EvaluateArgs) | set(flags), EVALUATE)
-    if asks_for_help(argv):
-        print_help(kind, EVALUATE, ABOUT[EVALUATE])
+    check_flags(argv, flags_of(EvaluateArgs) | set(flags) | {"--help-all"}, EVALUATE)
+    if "--help-all" in argv or asks_for_help(argv):
+        print_help(kind if "--help-all" in argv else with_help_texts(EvaluateArgs), EVALUATE, ABOUT[EVALUATE])
     parsed: Any = parse_or_say(lambda: tyro.cli(kind, args=argv, prog=EVALUATE), EVALUATE)
     conditions: dict[str, dict[str, Any]] = {}
     for word in argv:

@@ -55,7 +55,8 @@ Examples:
   edqn check rooms --seed 3""",
     EVALUATE: """Fly a policy on missions in any world and print metrics.
 
-Options with a group, such as --air.gusts-m-s, disturb the flights; without them they are as in training.
+Options with a group, such as --air.gusts-m-s, disturb the flights, which otherwise are as in training;
+`edqn evaluate --help-all` shows those, too.
 
 Examples:
   edqn evaluate pretrained --world dense --missions 100

@@ -195,7 +195,7 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--nun-envs", "64"], "there is no option '--nun-envs'; did you mean '--num-envs'?"),
         (["evaluate", "runs", "--misions=3"], "there is no option '--misions'; did you mean '--missions'?"),
         (["evaluate", "runs", "--gusts-m-s", "5"], "there is no option '--gusts-m-s'; did you mean '--air.gusts-m-s'?"),
-        (["evaluate", "runs", "--conditions", "5"], "there is no option '--conditions'; 'edqn evaluate --help' lists"),
+        (["evaluate", "runs", "--conditions", "5"], "there is no option '--conditions'; 'edqn evaluate --help-all' lists"),
         (["evaluate", "runs", "--env.speed-m-s", "5"], "there is no option '--env.speed-m-s'"),
         (["train", "--zzz"], "there is no option '--zzz'; 'edqn train --help-all' lists what there is"),
     ],
@@ -354,6 +354,12 @@ def test_help_all_lists_every_option_and_does_not_start_jax():
     assert "--agent.batch-size INT" in said and "Replayed samples per update." in said
     assert f"(default: {RANDOM_WORLDS['train']['total_steps']})" in said
     assert "--num-envs INT, --train.num-envs INT" in said
+
+
+def test_help_of_evaluate_leaves_what_disturbs_flights_to_help_all():
+    short, whole = shown("evaluate", "--help"), shown("evaluate", "--help-all")
+    assert len(short.splitlines()) < 60 and "--missions N" in short and "--air.gusts-m-s FLOAT" not in short
+    assert "`edqn evaluate --help-all`" in short and "--missions N" in whole and "--air.gusts-m-s FLOAT" in whole
 
 
 @pytest.mark.parametrize("flag", ["--help", "-h"])
