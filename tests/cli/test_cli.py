@@ -195,7 +195,7 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--nun-envs", "64"], "there is no option '--nun-envs'; did you mean '--num-envs'?"),
         (["evaluate", "runs", "--misions=3"], "there is no option '--misions'; did you mean '--missions'?"),
         (["evaluate", "runs", "--gusts-m-s", "5"], "there is no option '--gusts-m-s'; did you mean '--air.gusts-m-s'?"),
-        (["evaluate", "runs", "--conditions", "5"], "there is no option '--conditions'; 'edqn evaluate --help-all' lists"),
+        (["evaluate", "runs", "--conditions", "5"], "there is no option '--conditions'; 'edqn evaluate --help-all'"),
         (["evaluate", "runs", "--env.speed-m-s", "5"], "there is no option '--env.speed-m-s'"),
         (["train", "--zzz"], "there is no option '--zzz'; 'edqn train --help-all' lists what there is"),
     ],
