@@ -85,10 +85,10 @@ def pytest_configure(config: pytest.Config) -> None:
     entry's key holds the whole program, its options and XLA's flags, so a program that has changed is compiled again.
     The folder is the package's own (`edqn_jax.devices.cache`), which keeps to its size.
     """
-    if hasattr(config, "workerinput"):
-        return  # started by a process that has done this
     if config.args_source is config.ArgsSource.TESTPATHS and not config.option.markexpr:
         config.option.markexpr = "not whole"
+    if hasattr(config, "workerinput"):
+        return  # started by a process that has done the rest
     folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_programs(config))
     for name, value in (CACHE | {"jax_compilation_cache_dir": folder}).items():
         # Workers and children read the variables when they import JAX; this process has imported it.
