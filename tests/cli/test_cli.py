@@ -322,7 +322,7 @@ def test_evaluate_hands_on_the_disturbances_that_were_given_and_no_others(tmp_pa
     words = ["--air.gusts-m-s", "5", "--air.no-drag", "--env.action_delay=1", "--body.mass-share", "0"]
     given = parse_evaluate([str(tmp_path), *words]).conditions
     assert given == {"air": {"gusts_m_s": 5.0, "drag": False}, "env": {"action_delay": 1}, "body": {"mass_share": 0.0}}
-    assert shown("evaluate", "--help").count("--air.gusts-m-s FLOAT") == 1
+    assert shown("evaluate", "--help-all").count("--air.gusts-m-s FLOAT") == 1
 
 
 def shown(*words: str) -> str:
