@@ -46,6 +46,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--missions", type=int, default=1024, help="in each world, under both conditions (1024)")
     parser.add_argument("--weights", type=float, nargs="+", default=WEIGHTS, help="of the second, that are tried")
     args = parser.parse_args(argv)
+    if args.missions < 1:
+        parser.error(f"--missions must be at least 1, not {args.missions}")
+    if args.out.exists():
+        parser.error(f"'{args.out}' is there already; give a new folder")
     use_cpu_devices()
     try:
         first, second = load_policy(args.first), load_policy(args.second)

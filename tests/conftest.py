@@ -85,7 +85,7 @@ def pytest_configure(config: pytest.Config) -> None:
     entry's key holds the whole program, its options and XLA's flags, so a program that has changed is compiled again.
     The folder is the package's own (`edqn_jax.devices.cache`), which keeps to its size.
     """
-    if config.args_source is config.ArgsSource.TESTPATHS and not config.option.markexpr:
+    if config.args_source is config.ArgsSource.TESTPATHS and not (config.option.markexpr or config.option.keyword):
         config.option.markexpr = "not whole"
     if hasattr(config, "workerinput"):
         return  # started by a process that has done the rest
@@ -121,7 +121,7 @@ def pytest_collection_finish() -> None:
 def young_process() -> Iterator[None]:
     """Lets go of all that JAX has traced in a file once its tests are over.
 
-    JAX keeps the modules of what it has compiled, and with thousands of them lowers and traces up to twenty times as
+    JAX keeps the modules of what it has compiled, and with thousands of them traces six and lowers twenty times as
     slowly; what other files compile again comes from the cache on disk.
     """
     yield

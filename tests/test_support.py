@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import ast
 import re
+import types
 from pathlib import Path
 
 import pytest
+
+from tests import conftest
 
 ROOT = Path(__file__).parents[1]
 SHARED = ("tests.conftest", "tests.support", "tests.oracles", "tests.mutants", "tests.fuzz")
@@ -46,3 +49,24 @@ def test_what_is_not_shared_is_found_wherever_it_is_imported() -> None:
     assert unshared("import tests.whole.helpers") == ["tests.whole.helpers"]
     process = "import sys\n" + "from tests.sim.test_a import b"
     assert unshared(f"CODE = {process!r}") == ["tests.sim.test_a.b"]
+
+
+SOURCES = pytest.Config.ArgsSource
+
+
+@pytest.mark.parametrize(
+    ("source", "given", "then"),
+    [
+        (SOURCES.TESTPATHS, {}, "not whole"),
+        (SOURCES.TESTPATHS, {"markexpr": "whole"}, "whole"),
+        (SOURCES.TESTPATHS, {"markexpr": "not slow"}, "not slow"),
+        (SOURCES.TESTPATHS, {"keyword": "trainer"}, ""),
+        (SOURCES.ARGS, {}, ""),
+    ],
+)
+def test_tests_of_whole_policies_are_left_out_where_none_is_named(source, given: dict[str, str], then: str) -> None:
+    option = types.SimpleNamespace(**{"markexpr": "", "keyword": ""} | given)
+    # Workers choose for themselves: they are given the words of the command, and none of what was decided.
+    config = types.SimpleNamespace(args_source=source, ArgsSource=SOURCES, option=option, workerinput={})
+    conftest.pytest_configure(config)  # pyright: ignore[reportArgumentType]
+    assert option.markexpr == then

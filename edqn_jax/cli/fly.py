@@ -361,11 +361,13 @@ def simulate(args: FlyArgs) -> None:
     assert args.simulate is not None
     show_phase("reading policy and world")
     policy = load_policy(args.policy)
-    make(args.simulate, policy.config, worlds=1, split="test")  # its errors come before those of packages
+    # Before packages are missed that a flight needs: a world that there is none of is the first thing to say.
+    count = args.missions if args.jobs == 1 else 1
+    environment = make(args.simulate, policy.config, worlds=count, seed=args.seed, split="test")
 
     from edqn_jax.evaluation.metrics import wilson_interval
     from edqn_jax.evaluation.world_check import warn_of_training
-    from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_missions
+    from edqn_jax.fly.simulated.missions import Setup, fly_missions
     from edqn_jax.fly.simulated.several import fly_at_once
     from edqn_jax.interop.deployment.onnx_export import export_policy
 
@@ -381,11 +383,7 @@ def simulate(args: FlyArgs) -> None:
         answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal, "--least-rate", repr(args.least_rate)]
         more = (*answers, *(("--on", *args.on) if args.on else ()))
         setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace, autopilot=more)
-        flown = (
-            fly_missions(environment_of(*asked), setup)
-            if args.jobs == 1
-            else fly_at_once(*asked, setup, jobs=args.jobs)
-        )
+        flown = fly_missions(environment, setup) if args.jobs == 1 else fly_at_once(*asked, setup, jobs=args.jobs)
         show_phase("flying", 0, args.missions)
         for mission in flown:
             ended = sorted([*ended, mission], key=lambda each: each.number)

@@ -58,6 +58,9 @@ def test_the_mean_that_arrives_most_often_under_both_conditions_is_kept(
         second.params,
     )
     assert asked[:4] == [(0.0, "sparse", 8), (0.0, "rooms", 8), (4.0, "sparse", 8), (4.0, "rooms", 8)]
+    with pytest.raises(SystemExit):  # before anything is flown
+        average.main([*words, "--out", str(tmp_path / "mean")])
+    assert len(asked) == 12
     assert [json.loads(line)["weight"] for line in capsys.readouterr().out.splitlines()] == [0.0, 0.25, 1.0]
 
 
