@@ -64,10 +64,10 @@ AGAIN = (
 
 BODY = ("--camera.mount", "body", "--encoder.levelled")
 
-VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0}
+VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0, "narrow": 0}
 """Decisions between validations, by the worlds; 0 validates at the end alone: several seeds take minutes for one."""
 
-DECISIONS = {"open": 60_000_000, "mixed": 300_000_000}
+DECISIONS = {"open": 60_000_000, "mixed": 300_000_000, "narrow": 300_000_000}
 """Decisions of each seed, by the worlds that can be trained on."""
 
 KINDS: dict[str, tuple[int, tuple[str, ...]]] = {

@@ -49,7 +49,7 @@ class Config:
 
 
 CONDITIONS: dict[str, tuple[str, ...]] = {
-    "env": ("action_delay", "delay_share", "setpoint_m_s2", "drones"),
+    "env": ("action_delay", "delay_share", "setpoint_m_s2", "setpoint_share", "drones"),
     "events": (
         *("profile", "threshold", "tolerance", "contrast_on", "contrast_off", "refractory_ns", "bandwidth_hz"),
         *("threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_fraction", "hot_pixel_rate_hz"),

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from edqn_jax.config.learning import AgentConfig, EncoderConfig, TrainConfig
 from edqn_jax.config.options import Config
-from edqn_jax.config.registry import FAMILIES, has_detours
+from edqn_jax.config.registry import FAMILIES, MIXTURES, has_detours
 from edqn_jax.config.simulation import EnvConfig, EventsConfig, WorldConfig
 from edqn_jax.errors import ConfigError
 
@@ -144,9 +144,9 @@ def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]
         return []
     if world not in FAMILIES:
         return [GPU_FROM_FILE]
-    if world == "mixed":
-        return [GPU, GPU_MIXED]
-    return [GPU, GPU_CLOSED] if has_detours(world) else [GPU]
+    if not has_detours(world):
+        return [GPU]
+    return [GPU, GPU_MIXED if world in MIXTURES else GPU_CLOSED]
 
 
 def get_preset(name: str) -> Config:

@@ -96,8 +96,10 @@ CLOSED = ("rooms", "forest", "canyon")
 MIXTURES: dict[str, dict[str, int]] = {
     "open": dict.fromkeys(OPEN, 1),
     "mixed": {**dict.fromkeys(OPEN, 1), **dict.fromkeys(CLOSED, 3)},
+    "narrow": {**dict.fromkeys(OPEN, 1), "rooms": 6, "forest": 4, "canyon": 2},
 }
-"""Random worlds that are of one of several families, with their shares; a quarter of the mixed ones are open."""
+"""Random worlds that are of one of several families, with their shares; a quarter of the mixed ones are open, two
+thirds of the narrow ones rooms and forests, which are learnt last."""
 
 FAMILIES = Registry(
     "family of random worlds",
@@ -108,6 +110,7 @@ FAMILIES = Registry(
         **dict.fromkeys(CLOSED, "closed ones"),
         "open": "open ones of all three kinds",
         "mixed": "all six, a quarter of them open",
+        "narrow": "all six, two thirds of them rooms and forests",
         "moving": "medium ones in which obstacles move",
     },
     take=instance_of(

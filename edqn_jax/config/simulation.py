@@ -239,6 +239,8 @@ class EnvConfig:
     setpoint_m_s2: Annotated[float, NOT_NEGATIVE] = 0.0
     """Least rate at which an autopilot lets the velocity it holds change, m/s^2; an episode's is between this and any,
     its inverse uniform. 0 is off: the commanded velocity is held at once."""
+    setpoint_share: Annotated[float, RATE] = 1.0
+    """Share of the episodes, drawn for each, in which `setpoint_m_s2` limits."""
     heading: Literal["goal", "flight"] = "goal"
     """Where the drone and its camera turn to. `goal`: towards the goal. `flight`: towards where a move flies;
     needs `position` to be false."""

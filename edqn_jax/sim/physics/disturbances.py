@@ -105,6 +105,9 @@ def sample_disturbance(config: Config, hover_thrust: Array, key: Array) -> Distu
     if config.env.setpoint_m_s2:
         key, slow = jax.random.split(key)
         ramp = jax.random.uniform(slow, maxval=1 / config.env.setpoint_m_s2)
+        if config.env.setpoint_share < 1:
+            key, limits = jax.random.split(key)
+            ramp = jnp.where(jax.random.bernoulli(limits, config.env.setpoint_share), ramp, 0.0)
     azimuth, wind, gusts, mass, inertia, gain, lag, place, speed = jax.random.split(key, 9)
     air, body, motors, noise = config.air, config.body, config.motors, config.noise
     angle = jax.random.uniform(azimuth, maxval=2 * math.pi)

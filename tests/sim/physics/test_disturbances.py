@@ -249,6 +249,19 @@ def test_a_velocity_that_may_jump_is_flown_as_without_an_autopilot_and_a_slow_on
     np.testing.assert_allclose(held, [2.08, 0, 0], atol=1e-4)
 
 
+def test_the_autopilot_limits_a_share_of_the_episodes():
+    config = dataclasses.replace(QUIET, env=dataclasses.replace(QUIET.env, setpoint_m_s2=4.0, setpoint_share=0.3))
+
+    def ramp_of(key: jax.Array) -> Any:
+        drawn = disturbances.sample_disturbance(config, jnp.float32(1.0), key)
+        assert drawn is not None
+        return drawn.ramp
+
+    ramps = np.asarray(jax.vmap(ramp_of)(jax.random.split(jax.random.key(0), 2000)))
+    assert 0.25 < np.mean(ramps > 0) < 0.35  # five deviations of 2,000 draws
+    assert 0.23 < ramps.max() <= 0.25
+
+
 def test_the_controller_gives_the_nominal_thrust_so_that_a_light_drone_rises_and_a_weak_one_sinks():
     config = with_engine("rigid_body", Config(body=BodyConfig(mass_share=0.2), motors=MotorsConfig(gain_share=0.2)))
     gain = config.drone.climb_gain
