@@ -4,6 +4,8 @@ r"""Makes a policy that comes with the package: trains five seeds, measures the 
     python scripts/pretrain.py --kind looks --run runs/looks --out runs/looks-first
     python scripts/pretrain.py --kind further --start-from runs/looks-first --run runs/further \
         --out edqn_jax/policies/pretrained-looks
+    python scripts/pretrain.py --kind autopilot --world narrow --start-from edqn_jax/policies/pretrained-looks \
+        --run runs/autopilot --out edqn_jax/policies/pretrained-autopilot
     python scripts/pretrain.py --kind body --start-from runs/looks-first --run runs/body \
         --out edqn_jax/policies/pretrained-body
 
@@ -62,6 +64,8 @@ AGAIN = (
 )
 """What begins with a policy: its encoder learns again, by smaller steps; a fifth of the moves are random at first."""
 
+AUTOPILOT = ("--env.setpoint-m-s2", "4", "--env.setpoint-share", "0.75")
+
 BODY = ("--camera.mount", "body", "--encoder.levelled")
 
 VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0, "narrow": 0}
@@ -74,10 +78,11 @@ KINDS: dict[str, tuple[int, tuple[str, ...]]] = {
     "plaid": (0, ("--surface.pattern", "plaid")),
     "looks": (220_000_000, LOOKS),
     "further": (185_000_000, (*LOOKS, *AGAIN, "--encoder.retrain-at", "0.05", "0.35")),
+    "autopilot": (340_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, "--encoder.retrain-at", "0.05", "0.35")),
     "body": (230_000_000, (*LOOKS, *AGAIN, *BODY, "--encoder.retrain-at", "0.06", "0.3")),
 }
 """Decisions of each seed, 0 as `DECISIONS`, and further options, by the kind of policy: of one plaid, of any look, the
-latter trained further, and with a camera on the body; these two begin with one of any look."""
+latter trained further, for a slow autopilot, and with a camera on the body; these three begin with one of any look."""
 
 MISSIONS = 1000
 """Test worlds of each family; training never uses them."""
@@ -129,15 +134,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of policy and card; replaced")
     parser.add_argument("--world", choices=sorted(DECISIONS), default="mixed", help="to train on (default mixed)")
     parser.add_argument("--kind", choices=sorted(KINDS), default="plaid", help="of policy (default plaid)")
-    parser.add_argument("--start-from", type=Path, help="policy of any look that `further` and `body` begin with")
+    parser.add_argument("--start-from", type=Path, help="policy that `further`, `autopilot` and `body` begin with")
     parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a family (default {MISSIONS})")
     parser.add_argument("--trained", help="where and how long the run was trained, if its summary.json does not say")
     parser.add_argument("--commit", help="commit that the run was trained at; needed if it is not trained now")
     args = parser.parse_args(argv)
     if args.missions < 1:
         parser.error(f"--missions must be at least 1, not {args.missions}")
-    if (args.kind in ("further", "body")) != (args.start_from is not None):
-        parser.error("--start-from is for the kinds further and body, and needed there")
+    if (args.kind in ("further", "autopilot", "body")) != (args.start_from is not None):
+        parser.error("--start-from is for the kinds further, autopilot and body, and needed there")
     trained = args.run.is_dir()
     if trained and args.commit is None:
         parser.error(f"'{args.run}' was trained before; say with --commit at which commit")

@@ -172,4 +172,5 @@ ACTION_SETS = Registry(
 def has_detours(world: str) -> bool:
     """Returns whether a world is a random one in which the straight line to the goal is seldom free."""
     # Of built-in families without their modules, which import JAX.
-    return world in (*CLOSED, "mixed") or (world in FAMILIES.own and FAMILIES.get(world).detours)
+    families = MIXTURES.get(world, (world,))
+    return not set(CLOSED).isdisjoint(families) or (world in FAMILIES.own and FAMILIES.get(world).detours)

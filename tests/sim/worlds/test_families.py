@@ -12,6 +12,7 @@ import pytest
 import edqn_jax
 from edqn_jax.config import FAMILIES, MIXTURES
 from edqn_jax.config.loading import make_config
+from edqn_jax.config.registry import has_detours
 from edqn_jax.errors import ConfigError
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.planning.free_space import find_reachable
@@ -84,6 +85,11 @@ def test_worlds_of_a_mixture_are_of_its_families_in_their_shares(pools, mixture)
     # The standard deviation of each count is below 12; the keys are fixed.
     assert counts.sum() == 600 and np.abs(counts - 600 * shares / shares.sum()).max() < 3 * 12
     assert mixture == "open" or counts[:3].sum() < counts.sum() / 3
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_what_is_known_of_a_family_without_its_module_is_so(family):
+    assert has_detours(family) == FAMILIES.get(family).detours
 
 
 @pytest.mark.parametrize("family", FAMILIES)
