@@ -202,6 +202,7 @@ def fly(args: FlyArgs, stops: Stops) -> None:
     from edqn_jax.fly.simulated.lockstep import SimulatedClock
     from edqn_jax.fly.streams import open_events
     from edqn_jax.interop.recordings.lens import read_lens
+    from edqn_jax.policies.sizes import describe_larger
 
     assert args.events is not None and args.volume is not None
     with contextlib.ExitStack() as stack:
@@ -212,6 +213,10 @@ def fly(args: FlyArgs, stops: Stops) -> None:
         lens = None if args.calibration is None else read_lens(args.calibration)
         runner = load_runner(args, size, lens)
         settings = settings_of(args, size, runner.period_s / args.pace)
+        # Of files that were exported before, nothing is known.
+        known = runner.about.get("trained_in", {}).values()
+        for warning in describe_larger(np.subtract(args.volume[3:], args.volume[:3]), known):
+            print(warning)
         link = Link(args.mavlink, args.origin)
         stack.callback(link.close)
         log = None

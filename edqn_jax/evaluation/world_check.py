@@ -9,7 +9,6 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-import numpy.typing as npt
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.devices.memory import bytes_of
@@ -18,6 +17,7 @@ from edqn_jax.evaluation.missions import MissionSet, check_group
 from edqn_jax.evaluation.places import Point, moved_ends, place_world
 from edqn_jax.planning.path import point_text
 from edqn_jax.planning.widest import WidestWay, find_widest_way, is_roomy
+from edqn_jax.policies.sizes import describe_larger, sorted_sides
 from edqn_jax.policies.unseen import describe_unseen
 from edqn_jax.sim.camera.native import kinds_for_jax
 from edqn_jax.sim.scene.distance import shape_distances
@@ -33,9 +33,6 @@ MARGIN_M = 0.6
 
 In 40 x 20 x 6 m with three walls, each with a door as high, `pretrained` flew 26 % of 200 missions from random starts
 where doors were 1.4 m wide, 48 % of 1.7 m, 64 % of 2 m and 78 % of 2.6 m."""
-
-LARGER = 1.5
-"""A world is much larger than those of training if a side is so many times as long."""
 
 _PICTURE_US = {"c": 4.0, "jax": 45.0}
 """Microseconds of a picture of 32 x 24 pixels on two cores of a server without shapes, as measured."""
@@ -205,8 +202,8 @@ def warn_of_training(config: Config, start: Config | None = None) -> tuple[str, 
 def _warn_of_family(config: Config, name: str, trained_in: Mapping[str, Point]) -> list[str]:
     """Returns a warning if some of a family's worlds are much larger than those that the policy was trained in."""
     there = dataclasses.replace(config, world=dataclasses.replace(config.world, name=name))
-    sizes = [] if name not in FAMILIES else [_sorted_sides(size) for size in trained_sizes(there).values()]
-    return _warn_of_sides(np.max(sizes, axis=0), trained_in) if sizes else []
+    sizes = [] if name not in FAMILIES else [sorted_sides(size) for size in trained_sizes(there).values()]
+    return describe_larger(np.max(sizes, axis=0), trained_in.values()) if sizes else []
 
 
 def _warn_quickly(config: Config, name: str, scene: Scene, trained_in: Mapping[str, Point]) -> tuple[str, ...]:
@@ -329,27 +326,7 @@ def _warn_of_length(config: Config, way: WidestWay) -> list[str]:
 
 def _warn_of_size(found: WorldCheck, scene: Scene) -> list[str]:
     """Returns a warning if a world is much larger than those that the policy was trained in."""
-    return _warn_of_sides(_sorted_sides(np.subtract(*np.asarray(scene.volume, np.float64)[::-1])), found.trained_in)
-
-
-def _warn_of_sides(sides: np.ndarray, trained_in: Mapping[str, Point]) -> list[str]:
-    """Returns a warning if sides [3] of a volume, metres, sorted, are much longer than the known ones."""
-    if not trained_in:
-        return []
-    known = np.max([_sorted_sides(size) for size in trained_in.values()], axis=0)
-    if np.all(sides <= LARGER * known):
-        return []
-    here, there = (" × ".join(f"{side:.4g}" for side in each) for each in (sides, known))
-    return [
-        f"the flight volume of {here} m is much larger than those that the policy was trained in, at most {there} m: "
-        "how it flies there has not been measured"
-    ]
-
-
-def _sorted_sides(sides: npt.ArrayLike) -> np.ndarray:
-    """Returns sides [3] of a volume, metres: the longer level one, the other one, the height."""
-    x, y, z = np.asarray(sides)
-    return np.array([max(x, y), min(x, y), z])
+    return describe_larger(np.subtract(*np.asarray(scene.volume, np.float64)[::-1]), found.trained_in.values())
 
 
 def _warn_of_pictures(scene: Scene, title: str) -> list[str]:

@@ -331,6 +331,19 @@ def test_a_camera_or_a_room_that_does_not_fit_is_one_sentence(
     assert says in said and said.count("\n") == 1
 
 
+def test_a_volume_larger_than_those_of_training_is_warned_of(
+    exported: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server = EventServer(SIZE)
+    there = [str(exported), "--events", f"tcp:{server.address}", "--mavlink", f"udpin:127.0.0.1:{free_port()}"]
+    for far, warned in ((500, True), (100, False)):
+        words = ["--goal", "900", "0", "5", "--volume", "0", "-20", "0", str(far), "20", "9"]
+        assert main(["fly", *there, *words]) == 2  # the goal is outside
+        said = capsys.readouterr().out
+        assert ("the flight volume of 500 × 40 × 9 m is much larger than those" in said) == warned
+    server.close()
+
+
 def test_events_of_dv_processings_network_writer_are_read() -> None:
     pytest.importorskip("dv_processing")
     program = """

@@ -14,6 +14,7 @@ import pytest
 
 import edqn_jax
 from edqn_jax.errors import CheckError, ConfigError
+from edqn_jax.evaluation.world_check import trained_sizes
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.interop.deployment import onnx_export, runner
 from edqn_jax.interop.deployment.onnx_export import RUNNER, about_policy, export_policy
@@ -152,6 +153,12 @@ def test_own_state_and_motion_are_those_of_the_simulator():
             np.testing.assert_allclose(motion, each.motion, atol=2e-6)
     with pytest.raises(ValueError, match="leans with the body; give its 2 attitudes"):
         runner.with_lean(about_policy(lean.config), None, np.zeros(7, np.float32))
+
+
+def test_the_file_says_how_large_the_worlds_of_training_were(exported):
+    sizes = runner.Runner(exported).about["trained_in"]
+    assert sizes == {name: list(size) for name, size in trained_sizes(pretrained().config).items()}
+    assert sizes["rooms"] == [36, 36, 8] and len(sizes) == 6
 
 
 def test_it_remembers_until_it_is_reset(exported):

@@ -17,6 +17,7 @@ from jax import Array
 
 from edqn_jax.config import ENCODERS, Config
 from edqn_jax.errors import CheckError, ConfigError
+from edqn_jax.evaluation.world_check import trained_sizes
 from edqn_jax.extras import require_extra
 from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop.deployment import runner
@@ -183,6 +184,7 @@ def about_policy(config: Config) -> dict[str, Any]:
         "knows_position": config.env.position,
         "most_yaw_rate": MAX_YAW_RATE,
         "actions": ACTIONS.tolist(),
+        "trained_in": {name: list(size) for name, size in trained_sizes(config).items()},
         "action_names": [move_name(move) for move in range(len(ACTIONS))],
     }
 
