@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import shutil
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 import trimesh
 
 from edqn_jax.config import SHAPES
+from edqn_jax.native import build
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.shapes import field_rays
 from edqn_jax.sim.scene.shapes.field import _least_of_blocks
@@ -49,9 +51,9 @@ def meet(fields: Any, origin: Any, rays: Any) -> tuple[Any, ...]:
 
 def compare(monkeypatch: pytest.MonkeyPatch, mapped: Any, *given: Any) -> tuple[np.ndarray, ...]:
     """The results where there is a compiler, in C, once they are those in JAX."""
-    assert field_rays.is_available() is (shutil.which("cc") is not None)
+    assert field_rays.is_available("cpu") is (shutil.which("cc") is not None)
     in_c = [np.asarray(part) for part in jax.jit(lambda *args: mapped(*args))(*given)]
-    monkeypatch.setattr(field_rays, "is_available", lambda: False)
+    monkeypatch.setattr(field_rays, "is_available", lambda platform: False)
     in_jax = [np.asarray(part) for part in jax.jit(lambda *args: mapped(*args))(*given)]
     depth, hit = in_c[:2]
     assert hit.any() and not hit.all()
@@ -63,8 +65,10 @@ def compare(monkeypatch: pytest.MonkeyPatch, mapped: Any, *given: Any) -> tuple[
 
 
 def test_the_constants_in_c_are_those_of_python() -> None:
-    found = re.findall(r"^#define (\w+) ([\d.e+-]+)f?\b", field_rays.SOURCE.read_text(), re.MULTILINE)
+    text = "".join(field_rays.SOURCES[name].read_text() for name in ("c", "h"))
+    found = re.findall(r"^#define (\w+) ([\d.e+-]+)f?\b", text, re.MULTILINE)
     names = {"FAR": "FAR_M"}
+    found = [each for each in found if each[0] != "MOST_AXES"]
     assert len(found) == 8
     for name, value in found:
         assert float(value) == (TINY if name == "TINY" else getattr(field_rays, names.get(name) or name))
@@ -101,6 +105,43 @@ def test_frames_and_worlds_that_are_mapped_are_those_one_by_one(file: Path, monk
     monkeypatch.undo()
     alone = jax.jit(moved)(shifts[1], origins[2])[0]
     np.testing.assert_allclose(np.minimum(depth[1, 2], 1e9), np.minimum(alone, 1e9), rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def kernel() -> bool:
+    """Whether the kernel of GPUs is registered for the CPU, where there is a compiler."""
+    on_cpu = Path(__file__).parents[2] / "oracles" / "cuda_on_cpu.h"
+    words = "-xc", "-include", str(on_cpu), f"-D{field_rays.TARGET}=emulated_{field_rays.TARGET}"
+    compiler = dataclasses.replace(build.C, flags=(*build.C.flags, *words))
+    headers = field_rays.SOURCES["h"], on_cpu
+    return build.ensure_registered(
+        field_rays.SOURCES["cu"], (f"emulated_{field_rays.TARGET}",), by=compiler, headers=headers
+    )
+
+
+def test_the_kernel_of_gpus_meets_what_c_meets(kernel: bool, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the CPU, thread by thread."""
+    if not kernel:
+        assert shutil.which("cc") is None
+        return
+    fields, rays = load_scene(file).others["fields"], jnp.asarray(rays_ahead())
+    origins = jnp.array([[4.0, 4.6, 3.2], [4.5, 5.4, 2.9], [2.0, 5.0, 3.0]])
+    shifts = jnp.array([[0.0, 0.0, 0.0], [0.2, 0.1, 0.0]])
+
+    def moved(shift: Any, origin: Any) -> tuple[Any, ...]:
+        return meet(fields.replace(position=fields.position + shift), origin, rays)
+
+    every = jax.vmap(jax.vmap(moved, in_axes=(None, 0)), in_axes=(0, None))
+    in_c = [np.asarray(part) for part in jax.jit(lambda *given: every(*given))(shifts, origins)]
+    monkeypatch.setattr(field_rays, "TARGET", f"emulated_{field_rays.TARGET}")
+    in_cuda = [np.asarray(part) for part in jax.jit(lambda *given: every(*given))(shifts, origins)]
+    # A ray by itself begins elsewhere than one with its neighbours, and ends anywhere within `STOPS` of a surface.
+    assert (in_c[1] == in_cuda[1]).mean() > 0.99
+    both = in_c[1] & in_cuda[1]
+    assert both.sum() > 300
+    assert np.isclose(in_c[0][both], in_cuda[0][both], atol=0.02).mean() > 0.97
+    along = sum(ours[both] * theirs[both] for ours, theirs in zip(in_c[2:], in_cuda[2:], strict=True))
+    assert (along > 0.99).mean() > 0.95
 
 
 def test_a_ray_along_a_wall_arrives_at_the_one_behind(tmp_path: Path) -> None:

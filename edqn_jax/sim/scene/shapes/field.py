@@ -148,13 +148,12 @@ def _meet(fields: Fields, origin: Array, ray: Vector) -> Hits:
     """Returns where rays meet fields: they advance by the distance, within the box around each solid."""
     shape = jnp.broadcast_shapes(*(part.shape for part in ray))
     whole: Any = tuple(jnp.broadcast_to(part, shape)[0] for part in ray)
-    if field_rays.is_available():
-        table = _table(fields.grids)
-        grids = table.values, table.begin, table.least, table.blocks_begin, table.counts, table.cell
-        in_c = partial(field_rays.meet, grids)
-        depth, *normal = lax.platform_dependent(fields, origin, whole, cpu=in_c, default=_meet_in_jax)
-    else:
-        depth, *normal = _meet_in_jax(fields, origin, whole)
+    table = _table(fields.grids)
+    natively = partial(
+        field_rays.meet, (table.values, table.begin, table.least, table.blocks_begin, table.counts, table.cell)
+    )
+    with_library = {platform: natively for platform in ("cpu", "cuda") if field_rays.is_available(platform)}
+    depth, *normal = lax.platform_dependent(fields, origin, whole, **with_library, default=_meet_in_jax)
     return Hits.of(depth, depth < field_rays.NOWHERE, (normal[0], normal[1], normal[2]))
 
 

@@ -1,4 +1,4 @@
-"""Rays through fields in C, where there is a C compiler and a CPU; everywhere else `field.py` has the same in JAX."""
+"""Rays through fields in C, on GPUs in CUDA, where there is a compiler; elsewhere `field.py` has the same in JAX."""
 
 from __future__ import annotations
 
@@ -34,13 +34,14 @@ FAR_M = 1e30
 
 NOWHERE = 1e29
 
-SOURCE = Path(__file__).with_name("field_rays.c")
-_TARGET = "edqn_field_rays"
+SOURCES = {name: Path(__file__).with_name(f"field_rays.{name}") for name in ("h", "c", "cu")}
+TARGET = "edqn_field_rays"
 
 
-def is_available() -> bool:
-    """Returns whether the library is compiled, loaded and registered, which the first call does."""
-    return build.ensure_registered(SOURCE, (_TARGET,))
+def is_available(platform: str) -> bool:
+    """Returns whether the library of "cpu" or "cuda" is loaded and registered, which the first call does."""
+    compiler, source = (build.C, SOURCES["c"]) if platform == "cpu" else (build.cuda_compiler(), SOURCES["cu"])
+    return compiler is not None and build.ensure_registered(source, (TARGET,), by=compiler, headers=(SOURCES["h"],))
 
 
 def meet(table: tuple[np.ndarray, ...], fields: Any, origin: Array, ray: Vector) -> tuple[Array, Array, Array, Array]:
@@ -56,7 +57,7 @@ def meet(table: tuple[np.ndarray, ...], fields: Any, origin: Array, ray: Vector)
     shape, rays = ray[0].shape, jnp.stack([part.ravel() for part in ray], axis=-1)
     number, count = fields.position.shape[0], rays.shape[0]
     results = tuple(jax.ShapeDtypeStruct((number, count, *more), jnp.float32) for more in ((), (3,)))
-    call = jax.ffi.ffi_call(_TARGET, results, vmap_method="expand_dims")
+    call = jax.ffi.ffi_call(TARGET, results, vmap_method="expand_dims")
     place = fields.position, fields.rotation, fields.half, fields.grid
     given = [jnp.asarray(part, jnp.float32) for part in (*place, origin, rays)]
     depth, normal = call(*table, *given)
