@@ -6,6 +6,7 @@ median and 90th percentile, relative to the true distance and in metres. A polic
 dashes there.
 
     python benchmarks/looks.py --policy pretrained --world rooms --missions 200 --json looks.json
+    python benchmarks/looks.py --policy pretrained-looks --world rooms --missions 1000 --seed 7 --exact
 """
 
 from __future__ import annotations
@@ -28,6 +29,14 @@ from edqn_jax.runs.policies import load_policy
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
 
+EXACT: dict[str, dict[str, bool | float]] = {
+    "air": {"drag": False},
+    "body": {"mass_share": 0.0, "inertia_share": 0.0},
+    "motors": {"gain_share": 0.0, "lag_s": 0.0},
+    "env": {"setpoint_m_s2": 0.0, "action_delay": 0},
+}
+"""Conditions of a drone that flies as it is told."""
+
 HEAD = (
     "| surface.pattern | reached the goal | collisions | error, median | 90th percentile | frames |\n"
     "| --- | --- | ---: | ---: | ---: | ---: |"
@@ -46,6 +55,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--looks", nargs="+", default=list(LOOKS), choices=LOOKS, help="(default all)")
     parser.add_argument("--missions", type=at_least_one, default=200, help="number for each look (default 200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
+    parser.add_argument("--exact", action="store_true", help="without the errors of tracking of the policy's training")
     return parser.parse(argv)
 
 
@@ -62,11 +72,11 @@ def measure(args: argparse.Namespace, show: Callable[[str], None] = print) -> di
             missions=args.missions,
             seed=args.seed,
             decoder=decoder,
-            conditions={"surface": {"pattern": look}},
+            conditions={"surface": {"pattern": look}, **(EXACT if args.exact else {})},
         )
         looks.append({"pattern": look, **flown.figures})
         show(row(looks[-1]))
-    cell = {"policy": str(args.policy), "world": args.world, "seed": args.seed}
+    cell = {"policy": str(args.policy), "world": args.world, "seed": args.seed, "exact": args.exact}
     return {**json_report.machine(jax.devices()), "cell": cell, "looks": looks}
 
 

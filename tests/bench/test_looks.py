@@ -6,8 +6,10 @@ import json
 
 import pytest
 
-from edqn_jax.config.loading import to_yaml
+from edqn_jax.config.loading import to_yaml, with_conditions
 from edqn_jax.runs.checkpoints.params import save_params
+from edqn_jax.runs.policies import load_policy
+from edqn_jax.sim.physics.disturbances import any_on
 from tests.support.policies import CONFIG, always
 
 import looks  # isort: skip
@@ -21,6 +23,12 @@ def test_every_look_has_a_row_with_success_and_the_decoders_error(tmp_path, caps
     (look,) = json.loads((tmp_path / "looks.json").read_text())["looks"]
     assert look["pattern"] == "blank" and look["decoder"]["frames"] > 0
     assert looks.row(look) in capsys.readouterr().out
+
+
+def test_an_exact_flight_has_no_error_of_tracking():
+    slow = {"env": {"setpoint_m_s2": 4.0}}
+    trained = with_conditions(load_policy("pretrained-looks").config, slow, "evaluate")
+    assert any_on(trained) and not any_on(with_conditions(trained, looks.EXACT, "evaluate"))
 
 
 def test_a_policy_without_a_decoder_has_dashes():
