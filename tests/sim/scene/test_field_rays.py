@@ -136,7 +136,7 @@ def test_the_kernel_of_gpus_meets_what_c_meets(kernel: bool, file: Path, monkeyp
     monkeypatch.setattr(field_rays, "TARGET", f"emulated_{field_rays.TARGET}")
     in_cuda = [np.asarray(part) for part in jax.jit(lambda *given: every(*given))(shifts, origins)]
     # A ray by itself begins elsewhere than one with its neighbours, and ends anywhere within `STOPS` of a surface.
-    assert (in_c[1] == in_cuda[1]).mean() > 0.99
+    assert np.mean(in_c[1] == in_cuda[1]) > 0.99
     both = in_c[1] & in_cuda[1]
     assert both.sum() > 300
     assert np.isclose(in_c[0][both], in_cuda[0][both], atol=0.02).mean() > 0.97
