@@ -28,7 +28,7 @@ _ONE_AT_A_TIME = threading.Lock()
 
 _SHIPPED_SOURCES = tuple(Path(__file__).parents[1] / source for source in shipped.SOURCES)
 
-HEADER = Path(__file__).with_name("handler.h")
+HEADERS = tuple(Path(__file__).with_name(f"{name}.h") for name in ("handler", "kernel"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,9 +182,9 @@ def _load_library(
 ) -> ctypes.CDLL:
     """Returns the library, compiled in `folder` unless one of the same source, compiler and XLA is kept there."""
     defined = [f"-D{definition}" for definition in definitions]
-    searched = [f"-I{folder}" for folder in (jax.ffi.include_dir(), HEADER.parent)]
+    searched = [f"-I{folder}" for folder in (jax.ffi.include_dir(), HEADERS[0].parent)]
     command = [*compiler, *flags, *defined, *searched, str(source), "-lm"]
-    texts = [file.read_bytes() for file in (source, HEADER, *headers)]
+    texts = [file.read_bytes() for file in (source, *HEADERS, *headers)]
     told_apart = (command, _version(compiler), texts, jax.__version__)
     library = folder / f"{source.stem}-{hashlib.sha256(repr(told_apart).encode()).hexdigest()[:16]}.so"
     if library.is_file():

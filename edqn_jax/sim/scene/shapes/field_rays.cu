@@ -5,14 +5,7 @@
 
 #include <stdint.h>
 
-#ifndef LAUNCH
-#include <cuda_runtime.h>
-#define LAUNCH(kernel, blocks, stream, batch) kernel<<<(unsigned)(blocks), THREADS, 0, (cudaStream_t)(stream)>>>(batch)
-#define KERNEL_ON_CPU(kernel)
-#define EXPORTED extern "C"
-#define STREAM(call, args) (call)->api->XLA_FFI_Stream_Get(args)
-#define LAUNCH_ERROR() (cudaPeekAtLastError() == cudaSuccess ? 0 : cudaGetErrorString(cudaGetLastError()))
-#endif
+#include "kernel.h"
 
 #define FN static __device__ __forceinline__
 #define TOGETHER 1
