@@ -30,12 +30,13 @@ from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
 
 EXACT: dict[str, dict[str, bool | float]] = {
-    "air": {"drag": False},
+    "air": {"drag": False, "wind_m_s": 0.0, "gusts_m_s": 0.0},
     "body": {"mass_share": 0.0, "inertia_share": 0.0},
     "motors": {"gain_share": 0.0, "lag_s": 0.0},
     "env": {"setpoint_m_s2": 0.0, "action_delay": 0},
+    "noise": {"position_m": 0.0, "velocity_m_s": 0.0, "position_bias_m": 0.0, "velocity_bias_m_s": 0.0},
 }
-"""Conditions of a drone that flies as it is told."""
+"""Conditions without disturbances: nominal body and motors, no air, no delay, no errors of the state."""
 
 HEAD = (
     "| surface.pattern | reached the goal | collisions | error, median | 90th percentile | frames |\n"
@@ -55,7 +56,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--looks", nargs="+", default=list(LOOKS), choices=LOOKS, help="(default all)")
     parser.add_argument("--missions", type=at_least_one, default=200, help="number for each look (default 200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
-    parser.add_argument("--exact", action="store_true", help="without the errors of tracking of the policy's training")
+    parser.add_argument("--exact", action="store_true", help="without the disturbances of the policy's training")
     return parser.parse(argv)
 
 

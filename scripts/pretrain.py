@@ -5,7 +5,7 @@ r"""Makes a policy that comes with the package: trains five seeds, measures the 
     python scripts/pretrain.py --kind further --start-from runs/looks-first --run runs/further \
         --out edqn_jax/policies/pretrained-looks
     python scripts/pretrain.py --kind autopilot --world narrow --start-from edqn_jax/policies/pretrained-looks \
-        --run runs/autopilot --out edqn_jax/policies/pretrained-autopilot
+        --run runs/autopilot --out runs/autopilot-policy
     python scripts/pretrain.py --kind body --start-from runs/looks-first --run runs/body \
         --out edqn_jax/policies/pretrained-body
 
@@ -65,6 +65,7 @@ AGAIN = (
 """What begins with a policy: its encoder learns again, by smaller steps; a fifth of the moves are random at first."""
 
 AUTOPILOT = ("--env.setpoint-m-s2", "4", "--env.setpoint-share", "0.75")
+"""Three quarters of the episodes have an autopilot that changes the velocity it holds slowly."""
 
 BODY = ("--camera.mount", "body", "--encoder.levelled")
 

@@ -213,8 +213,7 @@ def fly(args: FlyArgs, stops: Stops) -> None:
         lens = None if args.calibration is None else read_lens(args.calibration)
         runner = load_runner(args, size, lens)
         settings = settings_of(args, size, runner.period_s / args.pace)
-        # Of files that were exported before, nothing is known.
-        known = runner.about.get("trained_in", {}).values()
+        known = runner.about.get("trained_in", [])  # older files hold no sizes
         for warning in describe_larger(np.subtract(args.volume[3:], args.volume[:3]), known):
             print(warning)
         link = Link(args.mavlink, args.origin)

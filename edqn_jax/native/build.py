@@ -16,7 +16,7 @@ import shlex
 import subprocess
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import jax
@@ -115,6 +115,12 @@ def ensure_registered(
     """
     with _ONE_AT_A_TIME:
         return _registered(source, targets, definitions, by, headers)
+
+
+def ensure_for(platform: str, sources: Mapping[str, Path], targets: tuple[str, ...], headers: tuple[Path, ...]) -> bool:
+    """Does `ensure_registered` for "cpu" with `sources["c"]`, and for "cuda" with `sources["cu"]`."""
+    by, source = (C, sources["c"]) if platform == "cpu" else (cuda_compiler(), sources["cu"])
+    return by is not None and ensure_registered(source, targets, by=by, headers=headers)
 
 
 @functools.cache

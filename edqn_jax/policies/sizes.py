@@ -12,7 +12,7 @@ LARGER = 1.5
 
 
 def describe_larger(sides: ArrayLike, trained_in: Iterable[ArrayLike]) -> list[str]:
-    """Returns a sentence if a flight volume is much larger than those of the training; else none.
+    """Returns a warning, in a list, if a flight volume is much larger than those of the training; else an empty one.
 
     Args:
         sides: [3] metres.

@@ -8,7 +8,6 @@ import pytest
 
 from edqn_jax.config.loading import to_yaml, with_conditions
 from edqn_jax.runs.checkpoints.params import save_params
-from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.physics.disturbances import any_on
 from tests.support.policies import CONFIG, always
 
@@ -25,10 +24,12 @@ def test_every_look_has_a_row_with_success_and_the_decoders_error(tmp_path, caps
     assert looks.row(look) in capsys.readouterr().out
 
 
-def test_an_exact_flight_has_no_error_of_tracking():
-    slow = {"env": {"setpoint_m_s2": 4.0}}
-    trained = with_conditions(load_policy("pretrained-looks").config, slow, "evaluate")
-    assert any_on(trained) and not any_on(with_conditions(trained, looks.EXACT, "evaluate"))
+@pytest.mark.parametrize("group, option", [(group, option) for group in looks.EXACT for option in looks.EXACT[group]])
+def test_an_exact_flight_has_no_disturbance(group, option):
+    disturbed = with_conditions(
+        CONFIG, {group: {option: {"drag": True, "action_delay": 1}.get(option, 0.1)}}, "evaluate"
+    )
+    assert any_on(disturbed) and not any_on(with_conditions(disturbed, looks.EXACT, "evaluate"))
 
 
 def test_a_policy_without_a_decoder_has_dashes():

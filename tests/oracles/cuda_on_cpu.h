@@ -1,4 +1,4 @@
-/* Runs kernels of CUDA on a CPU, one thread of a block after another: `cc -include` this before `pictures.cu`.
+/* Runs kernels of CUDA on a CPU, one thread of a block after another: `cc -include` this before a source of kernels.
  *
  * Every thread of a block runs until it waits for the others; when all do, they go on. All threads have to wait equally
  * often, which a GPU asks for as well and does not check. In every other block the last thread runs first, so that what

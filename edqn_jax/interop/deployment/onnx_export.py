@@ -184,7 +184,7 @@ def about_policy(config: Config) -> dict[str, Any]:
         "knows_position": config.env.position,
         "most_yaw_rate": MAX_YAW_RATE,
         "actions": ACTIONS.tolist(),
-        "trained_in": {name: list(size) for name, size in trained_sizes(config).items()},
+        "trained_in": [[float(side) for side in size] for size in trained_sizes(config).values()],
         "action_names": [move_name(move) for move in range(len(ACTIONS))],
     }
 

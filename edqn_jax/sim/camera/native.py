@@ -109,5 +109,4 @@ def _surfaces(scene: Scene, kind: str) -> Array | np.ndarray:
 
 def is_available(platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is loaded and registered, which the first call does."""
-    compiler, source = (build.C, SOURCES["c"]) if platform == "cpu" else (build.cuda_compiler(), SOURCES["cu"])
-    return compiler is not None and build.ensure_registered(source, TARGETS, by=compiler, headers=HEADERS)
+    return build.ensure_for(platform, SOURCES, TARGETS, HEADERS)

@@ -343,12 +343,7 @@ KERNEL_ON_CPU(measure_tilted)
   Batch batch;                                                                                         \
   XLA_FFI_Error* error = batch_of(call, weighted, &batch);                                             \
   if (error || !batch.frames) return error;                                                            \
-  XLA_FFI_Stream_Get_Args stream = {XLA_FFI_Stream_Get_Args_STRUCT_SIZE, 0, call->ctx, 0};             \
-  error = STREAM(call, &stream);                                                                       \
-  if (error) return error;                                                                             \
-  LAUNCH(kernel, (int64_t)batch.frames*((batch.width + COLUMNS - 1) / COLUMNS), stream.stream, batch); \
-  const char* said = LAUNCH_ERROR();                                                                   \
-  return said ? failed(call, XLA_FFI_Error_Code_INTERNAL, said) : 0
+  RETURN_LAUNCHED(kernel, (int64_t)batch.frames*((batch.width + COLUMNS - 1) / COLUMNS), call, batch)
 
 EXPORTED XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call) { DRAW(draw, 1); }
 
@@ -358,12 +353,4 @@ EXPORTED XLA_FFI_Error* edqn_tilted_pictures(XLA_FFI_CallFrame* call) { DRAW(dra
 
 EXPORTED XLA_FFI_Error* edqn_tilted_depths(XLA_FFI_CallFrame* call) { DRAW(measure_tilted, 0); }
 
-#ifdef __CUDACC__
-/* Returns why the kernels cannot be run on this machine, or 0. Asks nothing that would take memory on a card. */
-EXPORTED const char* edqn_unusable_pictures(void) {
-  int driver = 0, compiler = 0;
-  const cudaError_t error = cudaDriverGetVersion(&driver), other = cudaRuntimeGetVersion(&compiler);
-  if (error != cudaSuccess || other != cudaSuccess) return cudaGetErrorString(error != cudaSuccess ? error : other);
-  return driver / 1000 < compiler / 1000 ? "the driver is of an older major version of CUDA than nvcc" : 0;
-}
-#endif
+EXPORT_UNUSABLE(pictures)

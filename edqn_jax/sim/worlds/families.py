@@ -119,7 +119,8 @@ MOVING = dataclasses.replace(MEDIUM, moving_share=MOVING_SHARE)
 ROOMS = Family(rooms.sample_rooms, (rooms.SIDE, rooms.SIDE, rooms.HEIGHT[1]), detours=True)  # walls stand
 FOREST = Family(forest.sample_forest, forest.SIZE, bodies=forest.BODIES, detours=True)
 CANYON = Family(canyon.sample_canyon, canyon.SIZE, edge_m=0.7, bodies=canyon.BODIES, detours=True)
-OPEN, MIXED, NARROW = (Mixture(shares, detours=name != "open") for name, shares in MIXTURES.items())
+OPEN, MIXED = Mixture(MIXTURES["open"]), Mixture(MIXTURES["mixed"], detours=True)
+NARROW = Mixture(MIXTURES["narrow"], detours=True)
 
 
 def random_scene(family: str, key: Array) -> Scene:

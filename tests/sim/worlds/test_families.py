@@ -82,7 +82,7 @@ def test_worlds_of_a_mixture_are_of_its_families_in_their_shares(pools, mixture)
         assert_same_world(take_scene(pools[mixture], i), take_scene(pools[names[i]], i))
     counts = np.array([names.count(family) for family in MIXTURES[mixture]])
     shares = np.array(list(MIXTURES[mixture].values()))
-    # The standard deviation of each count is below 12; the keys are fixed.
+    # The standard deviation of each count is at most 12; the keys are fixed.
     assert counts.sum() == 600 and np.abs(counts - 600 * shares / shares.sum()).max() < 3 * 12
     assert mixture == "open" or counts[:3].sum() < counts.sum() / 3
 

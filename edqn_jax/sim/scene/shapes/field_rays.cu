@@ -3,8 +3,6 @@
  * (`tests/oracles/cuda_on_cpu.h`).
  */
 
-#include <stdint.h>
-
 #include "kernel.h"
 
 #define FN static __device__ __forceinline__
@@ -28,10 +26,7 @@ EXPORTED XLA_FFI_Error* edqn_field_rays(XLA_FFI_CallFrame* call) {
   XLA_FFI_Error* error = batch_of(call, &batch);
   const int64_t rays = error ? 0 : batch.rows * batch.fields * batch.count;
   if (error || !rays) return error;
-  XLA_FFI_Stream_Get_Args stream = {XLA_FFI_Stream_Get_Args_STRUCT_SIZE, 0, call->ctx, 0};
-  error = STREAM(call, &stream);
-  if (error) return error;
-  LAUNCH(meet, (rays + THREADS - 1) / THREADS, stream.stream, batch);
-  const char* said = LAUNCH_ERROR();
-  return said ? failed(call, XLA_FFI_Error_Code_INTERNAL, said) : 0;
+  RETURN_LAUNCHED(meet, (rays + THREADS - 1) / THREADS, call, batch);
 }
+
+EXPORT_UNUSABLE(field_rays)

@@ -6,9 +6,11 @@
  * how many rays go TOGETHER.
  */
 
+#ifndef EDQN_FIELD_RAYS_H
+#define EDQN_FIELD_RAYS_H
+
 #include <math.h>
 #include <stdint.h>
-#include <string.h>
 
 #include "xla/ffi/api/c_api.h"
 #include "handler.h"
@@ -156,7 +158,7 @@ FN void march(const Lattice* g, Rays* r) {
 
 /* Rays [count, 3] from `origin` and one field, turned by `t`: depths [count] and normals [count, 3]. */
 FN void draw(const Lattice* g, const float* position, const float* t, const float* half, const float* origin,
-                 const float* rays, int64_t count, float* depths, float* normals) {
+             const float* rays, int64_t count, float* depths, float* normals) {
   float away[3];
   Rays r;
   for (int i = 0; i < 3; ++i) away[i] = origin[i] - position[i];
@@ -262,3 +264,5 @@ FN void draw_some(const Batch* b, uint32_t m, int64_t n, int64_t begin, int64_t 
   draw(&g, of[POSITION] + 3 * n, of[ROTATION] + 9 * n, of[HALF] + 3 * n, of[ORIGIN], of[RAYS] + 3 * begin, end - begin,
        b->depth + at, b->normal + 3 * at);
 }
+
+#endif

@@ -40,8 +40,7 @@ TARGET = "edqn_field_rays"
 
 def is_available(platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is loaded and registered, which the first call does."""
-    compiler, source = (build.C, SOURCES["c"]) if platform == "cpu" else (build.cuda_compiler(), SOURCES["cu"])
-    return compiler is not None and build.ensure_registered(source, (TARGET,), by=compiler, headers=(SOURCES["h"],))
+    return build.ensure_for(platform, SOURCES, (TARGET,), (SOURCES["h"],))
 
 
 def meet(table: tuple[np.ndarray, ...], fields: Any, origin: Array, ray: Vector) -> tuple[Array, Array, Array, Array]:
