@@ -122,7 +122,8 @@ def depths_by(in_c: bool) -> Any:
                 patch.setattr(field_rays, "is_available", lambda platform: False)
             lowered = depths.lower(*given)
             assert (field_rays.TARGET in lowered.as_text()) == (in_c and shutil.which("cc") is not None)
-            return lowered.compile()(*given)
+            # As users have it: without optimisation, as tests are compiled, some of JAX's rays end a cell too far.
+            return lowered.compile({"xla_backend_optimization_level": 3})(*given)
 
     return call
 
@@ -150,11 +151,9 @@ def test_the_camera_sees_it_where_its_triangles_are(
     ours = np.asarray(DEPTHS[in_c](scene, eye, jnp.float32(time))).ravel()
     theirs = mesh.ray_depths(eye, rays, time)
     met = np.isfinite(ours)
-    # No ray passes a triangle, and none ends further from all of them than distances may be too small. Without
-    # optimisation, as tests compile, XLA rounds a place in two ways, and JAX's rays can be lost where cells meet.
-    passed, apart = ours > theirs + 0.03, mesh.distances(eye + ours[met, None] * rays[met], time) >= SLACK_M
-    lost = 0 if in_c else 0.02 * len(rays)
-    assert np.isfinite(theirs).sum() >= 4 and passed.sum() <= lost and apart.sum() <= lost
+    # No ray passes a triangle, and none ends further from all of them than distances may be too small.
+    assert np.isfinite(theirs).sum() >= 4 and np.all(ours <= theirs + 0.03)
+    assert np.all(mesh.distances(eye + ours[met, None] * rays[met], time) < SLACK_M)
 
 
 @jax.jit
