@@ -87,6 +87,8 @@ def test_worlds_with_walls_are_learnt_along_their_ways_and_open_ones_are_not(har
     assert (rooms.env.reward, medium.env.reward) == ("geodesic", "progress")
     assert rooms.env.collision_reward == medium.env.collision_reward
     assert rooms.train == medium.train and rooms.encoder == medium.encoder
+    narrow = resolve_config(world="narrow", tuned_for=hardware)
+    assert dataclasses.replace(narrow, world=mixed.world) == mixed and narrow.world.name == "narrow"
 
 
 def test_a_world_that_somebody_drew_is_learnt_along_its_ways_and_the_papers_map_is_not(tmp_path):

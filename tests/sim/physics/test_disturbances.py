@@ -249,15 +249,16 @@ def test_a_velocity_that_may_jump_is_flown_as_without_an_autopilot_and_a_slow_on
     np.testing.assert_allclose(held, [2.08, 0, 0], atol=1e-4)
 
 
+def drawn_often(config: Config) -> Any:
+    """The disturbances of 2,000 episodes."""
+    draw = partial(disturbances.sample_disturbance, config, jnp.float32(1.0))
+    return jax.vmap(draw)(jax.random.split(jax.random.key(0), 2000))
+
+
 def test_the_autopilot_limits_a_share_of_the_episodes():
     config = dataclasses.replace(QUIET, env=dataclasses.replace(QUIET.env, setpoint_m_s2=4.0, setpoint_share=0.3))
 
-    def ramp_of(key: jax.Array) -> Any:
-        drawn = disturbances.sample_disturbance(config, jnp.float32(1.0), key)
-        assert drawn is not None
-        return drawn.ramp
-
-    ramps = np.asarray(jax.vmap(ramp_of)(jax.random.split(jax.random.key(0), 2000)))
+    ramps = np.asarray(drawn_often(config).ramp)
     assert 0.25 < np.mean(ramps > 0) < 0.35  # five deviations of 2,000 draws
     assert 0.23 < ramps.max() <= 0.25
 
@@ -422,13 +423,7 @@ def test_a_delayed_move_is_flown_one_decision_later_and_known_at_once(world):
 def test_a_share_of_the_episodes_is_late_and_each_from_its_first_decision_to_its_last():
     config = dataclasses.replace(QUIET, env=dataclasses.replace(QUIET.env, action_delay=1, delay_share=0.3))
 
-    def is_late(key: jax.Array) -> Any:
-        drawn = disturbances.sample_disturbance(config, jnp.float32(1.0), key)
-        assert drawn is not None
-        return drawn.late
-
-    late = jax.vmap(is_late)(jax.random.split(jax.random.key(0), 2000))
-    assert 0.25 < float(jnp.mean(late)) < 0.35  # five deviations of 2,000 draws
+    assert 0.25 < np.mean(drawn_often(config).late) < 0.35  # five deviations of 2,000 draws
     assert moves_flown(config, late=False) == [AHEAD, BACK]
     assert moves_flown(config, late=True) == [0, AHEAD]
 

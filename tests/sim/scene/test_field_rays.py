@@ -57,10 +57,10 @@ def compare(monkeypatch: pytest.MonkeyPatch, mapped: Any, *given: Any) -> tuple[
     in_jax = [np.asarray(part) for part in jax.jit(lambda *args: mapped(*args))(*given)]
     depth, hit = in_c[:2]
     assert hit.any() and not hit.all()
-    # Without optimisation XLA rounds a place in one way for one of its results and in another one for the next.
+    # At edges a place may be rounded into either of two cells, which have other slopes.
     for ours, theirs, apart in zip(in_c, in_jax, (1e-5, 0, 1e-3, 1e-3, 1e-3), strict=True):
         same = np.isclose(ours.astype(float), theirs.astype(float), rtol=apart, atol=apart)
-        assert same.mean() > 0.97
+        assert same.all() if ours is in_c[0] or ours is in_c[1] else same.mean() > 0.99
     return tuple(in_c)
 
 

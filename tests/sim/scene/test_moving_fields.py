@@ -122,9 +122,7 @@ def depths_by(in_c: bool) -> Any:
                 patch.setattr(field_rays, "is_available", lambda platform: False)
             lowered = depths.lower(*given)
             assert (field_rays.TARGET in lowered.as_text()) == (in_c and shutil.which("cc") is not None)
-            # As users have it: without optimisation, as tests are compiled, some of JAX's rays end a cell too far.
-            as_users_do: Any = {"xla_backend_optimization_level": 3}
-            return lowered.compile(as_users_do)(*given)
+            return lowered.compile()(*given)
 
     return call
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -45,6 +45,8 @@ SLACK_M = 0.1
 
 TOUCHES = 1e-6
 """Metres that are none."""
+
+State = TypeVar("State")
 
 _MOST_FACES = 400  # of a solid in pictures
 _MOST_TRIANGLES = 50_000  # of a mesh on the page
@@ -180,13 +182,19 @@ def _meet_in_jax(fields: Fields, origin: Array, ray: Vector) -> tuple[Array, Arr
         going = (room >= cell) & (depth < leave) & (enter < leave)
         return going, jnp.where(going, depth + room * per_length, depth)
 
-    def step(depth: Array) -> tuple[Array, Array]:
-        left, _ = _along(fields, o, d, depth)
+    def step(at: tuple[Array, Vector]) -> tuple[Array, tuple[Array, Vector]]:
+        depth, place = at
+        left, _ = _interpolate(fields, place)
         going = (left >= near + field_rays.CONE * depth) & (depth < leave) & (enter < leave)
-        return going, jnp.where(going, depth + left * per_length, depth)
+        return going, placed(jnp.where(going, depth + left * per_length, depth))
 
-    depth = _repeat(step, _repeat(coarse, depth))
-    _, slopes = _along(fields, o, d, depth)
+    def placed(depth: Array) -> tuple[Array, Vector]:
+        # A place is carried along: computed twice, it may be rounded to either side of where cells meet, and the value
+        # of one cell be read at the share of the other.
+        return depth, (o[0] + depth * d[0], o[1] + depth * d[1], o[2] + depth * d[2])
+
+    depth, place = _repeat(step, placed(_repeat(coarse, depth)))
+    _, slopes = _interpolate(fields, place)
     hit = (depth > 0) & (depth < leave)
     scale = safe_inverse(norm(*slopes))
     normal = [scale * sum(turn[i][j] * slopes[i] for i in range(3)) for j in range(3)]
@@ -211,11 +219,6 @@ def _march_together(fields: Fields, o: Any, d: Any, cell: Array, enter: Array, l
     return _repeat(step, first)
 
 
-def _along(fields: Fields, o: Any, d: Any, depth: Array) -> tuple[Array, Vector]:
-    """Returns distances and slopes at depths of rays from `o` in directions `d`, in each field's own axes."""
-    return _interpolate(fields, (o[0] + depth * d[0], o[1] + depth * d[1], o[2] + depth * d[2]))
-
-
 def _least_along(fields: Fields, o: Any, d: Any, depth: Array) -> Array:
     """Returns the least distances in the blocks where such rays are."""
     table, number = _table(fields.grids), per_shape(fields.grid.astype(jnp.int32))
@@ -234,14 +237,14 @@ def _length(vector: Any) -> Array:
     return jnp.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
 
 
-def _repeat(step: Callable[[Array], tuple[Array, Array]], depth: Array) -> Array:
-    """Returns depths after steps, at most `STEPS`, until none goes on; a step returns which do, and the next depths."""
+def _repeat(step: Callable[[State], tuple[Array, State]], state: State) -> State:
+    """Returns the state after steps, at most `STEPS`, until none goes on; a step returns which do, and what is next."""
 
-    def more(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def more(carry: tuple[Array, State, Array]) -> tuple[Array, State, Array]:
         going, moved = step(carry[1])
         return carry[0] + 1, moved, jnp.any(going)
 
-    begin = (jnp.zeros((), jnp.int32), depth, jnp.ones((), bool))
+    begin = (jnp.zeros((), jnp.int32), state, jnp.ones((), bool))
     return lax.while_loop(lambda carry: carry[2] & (carry[0] < field_rays.STEPS), more, begin)[1]
 
 
