@@ -99,17 +99,26 @@ def _least_of_blocks(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _interpolate(fields: Fields, place: Vector) -> tuple[Array, Vector]:
-    """Returns distances [N, ...] at places in each field's own axes, and their slopes; outside those of the border."""
-    table, number = _table(fields.grids), fields.grid.astype(jnp.int32)
-    number = number.reshape(number.shape + (1,) * (place[0].ndim - 1))
+def _in_cells(fields: Fields, place: Vector) -> Vector:
+    """Returns places in each field's own axes as numbers of values on its grid; those outside as the nearest on it."""
+    table, number = _table(fields.grids), _grid_numbers(fields, place[0].ndim)
     counts, cell = jnp.asarray(table.counts)[number], jnp.asarray(table.cell)[number]
-    lower, part = [], []
-    for i in range(3):
-        last = counts[..., i] - 1
-        at = jnp.clip(place[i] / cell + last / 2, 0.0, last)
-        lower.append(jnp.minimum(at.astype(jnp.int32), last - 1))
-        part.append(at - lower[i])
+    x, y, z = (jnp.clip(place[i] / cell + (counts[..., i] - 1) / 2, 0.0, counts[..., i] - 1.0) for i in range(3))
+    return x, y, z
+
+
+def _grid_numbers(fields: Fields, dimensions: int) -> Array:
+    """Returns the number of each field's grid: [N], with as many axes of 1 as places of `dimensions` need."""
+    number = fields.grid.astype(jnp.int32)
+    return number.reshape(number.shape + (1,) * (dimensions - 1))
+
+
+def _interpolate(fields: Fields, at: Vector) -> tuple[Array, Vector]:
+    """Returns distances [N, ...] at places `_in_cells`, and their slopes along each field's own axes."""
+    table, number = _table(fields.grids), _grid_numbers(fields, at[0].ndim)
+    counts = jnp.asarray(table.counts)[number]
+    lower = [jnp.minimum(at[i].astype(jnp.int32), counts[..., i] - 2) for i in range(3)]
+    part = [at[i] - lower[i] for i in range(3)]
     across, along, values = counts[..., 1] * counts[..., 2], counts[..., 2], jnp.asarray(table.values)
     first = jnp.asarray(table.begin)[number] + lower[0] * across + lower[1] * along + lower[2]
 
@@ -140,7 +149,7 @@ def _distance(fields: Fields, x: Array, y: Array, z: Array) -> Array:
     reach = (jnp.asarray(table.counts)[number] - 1) * (jnp.asarray(table.cell)[number] / 2)[:, None]
     beyond = norm(*(jnp.maximum(jnp.abs(place[i]) - reach[:, i], 0.0) for i in range(3)))
     to_box = norm(*(jnp.maximum(jnp.abs(place[i]) - fields.half[:, i], 0.0) for i in range(3)))
-    inside, _ = _interpolate(fields, place)
+    inside, _ = _interpolate(fields, _in_cells(fields, place))
     # The grid's border lies between a point beyond it and the solid, at a right or a blunt angle.
     found = jnp.where(beyond > TOUCHES, norm(beyond, jnp.maximum(inside, 0.0)), inside)
     return jnp.where(to_box > TOUCHES, jnp.maximum(found, to_box), found)
@@ -183,18 +192,18 @@ def _meet_in_jax(fields: Fields, origin: Array, ray: Vector) -> tuple[Array, Arr
         return going, jnp.where(going, depth + room * per_length, depth)
 
     def step(at: tuple[Array, Vector]) -> tuple[Array, tuple[Array, Vector]]:
-        depth, place = at
-        left, _ = _interpolate(fields, place)
+        depth, cells = at
+        left, _ = _interpolate(fields, cells)
         going = (left >= near + field_rays.CONE * depth) & (depth < leave) & (enter < leave)
         return going, placed(jnp.where(going, depth + left * per_length, depth))
 
     def placed(depth: Array) -> tuple[Array, Vector]:
-        # A place is carried along: computed twice, it may be rounded to either side of where cells meet, and the value
-        # of one cell be read at the share of the other.
-        return depth, (o[0] + depth * d[0], o[1] + depth * d[1], o[2] + depth * d[2])
+        # Carried along: computed twice, a place may be rounded to either side of where cells meet, and the value of one
+        # cell be read at the share of the other.
+        return depth, _in_cells(fields, (o[0] + depth * d[0], o[1] + depth * d[1], o[2] + depth * d[2]))
 
-    depth, place = _repeat(step, placed(_repeat(coarse, depth)))
-    _, slopes = _interpolate(fields, place)
+    depth, cells = _repeat(step, placed(_repeat(coarse, depth)))
+    _, slopes = _interpolate(fields, cells)
     hit = (depth > 0) & (depth < leave)
     scale = safe_inverse(norm(*slopes))
     normal = [scale * sum(turn[i][j] * slopes[i] for i in range(3)) for j in range(3)]
