@@ -8,14 +8,16 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
+from edqn_jax.fly.simulated.manners import Limits
 from edqn_jax.interop.deployment.runner import Command
 from edqn_jax.interop.outer.poses import Body, Track
 from edqn_jax.interop.outer.rotorpy_body import STEP_S, RotorPyBody
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics import drone
 
-KINDS = ("own", "rotorpy", "rotorpy-steps")
-"""Who flies. `rotorpy-steps`: its controller's setpoint jumps with each command."""
+KINDS = ("own", "rotorpy", "rotorpy-px4", "rotorpy-steps")
+"""Who flies. `rotorpy-px4`: with PX4's limits of acceleration, tilt and thrust, the vehicle of `edqn fly --simulate`.
+`rotorpy-steps`: its controller's setpoint jumps with each command."""
 
 SETPOINT_M_S2 = 8.0
 """How fast the velocity changes that RotorPy's controller is given, as an autopilot limits it."""
@@ -60,10 +62,15 @@ class RotorPyFlight:
     """RotorPy's quadrotor, whose setpoints change by at most `setpoint_m_s2` and turn at most at the largest rate."""
 
     def __init__(
-        self, start: NDArray[np.float64], goal: NDArray[np.float64], max_yaw_rate: float, setpoint_m_s2: float
+        self,
+        start: NDArray[np.float64],
+        goal: NDArray[np.float64],
+        max_yaw_rate: float,
+        setpoint_m_s2: float,
+        **limits: float,
     ) -> None:
         yaw = float(np.arctan2(goal[1] - start[1], goal[0] - start[0]))
-        self._body = RotorPyBody(start, yaw, max_yaw_rate, setpoint_m_s2)
+        self._body = RotorPyBody(start, yaw, max_yaw_rate, setpoint_m_s2, **limits)
 
     def body(self) -> Body:
         """Returns what it knows of itself now."""
@@ -87,6 +94,9 @@ def start_flight(kind: str, environment: Environment, mission: int, max_yaw_rate
     """
     if kind == "own":
         return OwnFlight(environment, mission)
-    limit = np.inf if kind == "rotorpy-steps" else SETPOINT_M_S2
+    limits = {"setpoint_m_s2": np.inf if kind == "rotorpy-steps" else SETPOINT_M_S2}
+    if kind == "rotorpy-px4":
+        limits = Limits().of_body()
     scene = jax.tree.map(np.asarray, environment.scene(mission))
-    return RotorPyFlight(np.asarray(scene.start, np.float64), np.asarray(scene.goal, np.float64), max_yaw_rate, limit)
+    start, goal = np.asarray(scene.start, np.float64), np.asarray(scene.goal, np.float64)
+    return RotorPyFlight(start, goal, max_yaw_rate, **limits)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import edqn_jax
+from edqn_jax.fly.simulated.manners import Limits
 from edqn_jax.interop.deployment.runner import Command
 from edqn_jax.interop.outer import event_cameras
 from edqn_jax.interop.outer.poses import Track, heading_of
@@ -70,8 +71,8 @@ def test_what_a_policy_never_saw_is_said(words, config, told):
     assert len(said) == len(told) and all(part in each for part, each in zip(told, said, strict=True))
 
 
-def rotorpy(setpoint_m_s2: float = flights.SETPOINT_M_S2) -> flights.RotorPyFlight:
-    return flights.RotorPyFlight(np.array([0.0, 0.0, 5.0]), np.array([10.0, 0.0, 5.0]), 2.0, setpoint_m_s2)
+def rotorpy(setpoint_m_s2: float = flights.SETPOINT_M_S2, **limits: float) -> flights.RotorPyFlight:
+    return flights.RotorPyFlight(np.array([0.0, 0.0, 5.0]), np.array([10.0, 0.0, 5.0]), 2.0, setpoint_m_s2, **limits)
 
 
 def rotorpy_after(velocity: tuple[float, float, float], seconds: float) -> tuple[flights.RotorPyFlight, Track]:
@@ -97,6 +98,26 @@ def test_a_setpoint_that_jumps_makes_rotorpys_controller_turn_the_drone(limit, t
         turned += [abs(heading_of(each)) for each in flight.fly(command, 0.26).quaternion]
     least, most = np.radians(turned_deg)
     assert least <= max(turned) <= most
+
+
+DESCENTS = np.array([(4.0, 0.0, 4.0), (4.0, 0.0, -4.0), (0.0, 4.0, 4.0), (-4.0, 0.0, -4.0)])
+
+
+def most_lean_deg(flight: flights.RotorPyFlight) -> float:
+    leans = []
+    for velocity in DESCENTS:
+        command = Command(0, velocity.astype(np.float32), 0.0, np.zeros(27, np.float32))
+        _, x, y, _ = flight.fly(command, 0.52).quaternion.T
+        leans.append(np.degrees(np.arccos(1 - 2 * (x * x + y * y))).max())
+    return max(leans)
+
+
+@pytest.mark.parametrize("rate", [5.0, 30.0])
+def test_an_autopilots_limits_keep_rotorpys_thrust_upwards(rate):
+    limits = Limits(MPC_ACC_HOR_MAX=rate).of_body()
+    assert most_lean_deg(rotorpy(**limits)) < 45 + 5  # its attitude overshoots what is asked
+    if rate == 30.0:
+        assert most_lean_deg(rotorpy(rate)) > 90  # a descent that is faster than a fall
 
 
 def test_rotorpy_turns_to_the_commanded_heading():

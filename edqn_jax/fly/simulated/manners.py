@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +17,24 @@ OFFBOARD, HOLD, LAND, POSITION = (6, 0), (4, 3), (4, 6), (3, 0)
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Parameters of PX4 with their defaults, but for the last two, which a policy of 4 m/s needs so."""
+    """Parameters of PX4 with their defaults, but for the last three, which a policy of 4 m/s needs so."""
 
     COM_OF_LOSS_T: float = 0.5
     """Seconds without a setpoint after which offboard mode is left."""
     MPC_XY_VEL_MAX: float = 12.0
     """m/s."""
-    MPC_ACC_HOR_MAX: float = 8.0
-    """m/s²."""
+    MPC_ACC_HOR_MAX: float = 5.0
+    """m/s², here of the velocity's change in any direction."""
     MPC_TILTMAX_AIR: float = 45.0
     """Degrees."""
-    MPC_YAWRAUTO_MAX: float = 114.6
-    """Degrees a second: the 2 rad/s of our training; PX4's own is 45."""
+    MPC_THR_MIN: float = 0.12
+    """Least thrust, a share of the largest."""
+    MPC_THR_HOVER: float = 0.5
+    """Thrust that holds the weight, likewise."""
     MPC_LAND_SPEED: float = 0.7
     """m/s."""
+    MPC_YAWRAUTO_MAX: float = 114.6
+    """Degrees a second: the 2 rad/s of our training; PX4's own is 45."""
     MPC_Z_VEL_MAX_UP: float = 4.0
     """m/s; PX4's default is 3."""
     MPC_Z_VEL_MAX_DN: float = 4.0
@@ -41,6 +46,14 @@ class Limits:
         share = min(1.0, self.MPC_XY_VEL_MAX / max(across, 1e-9))
         up = float(np.clip(velocity[2], -self.MPC_Z_VEL_MAX_DN, self.MPC_Z_VEL_MAX_UP))
         return np.array([share * velocity[0], share * velocity[1], up])
+
+    def of_body(self) -> dict[str, float]:
+        """Returns what `RotorPyBody` is given of these."""
+        return {
+            "setpoint_m_s2": self.MPC_ACC_HOR_MAX,
+            "max_tilt_rad": math.radians(self.MPC_TILTMAX_AIR),
+            "least_thrust": self.MPC_THR_MIN / self.MPC_THR_HOVER,
+        }
 
 
 class Manners:

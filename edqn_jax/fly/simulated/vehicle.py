@@ -49,14 +49,8 @@ class Vehicle:
         self._ground = args.ground
         limits = Limits()
         self.manners = Manners(limits, armed=not args.unarmed, airborne=not args.unarmed)
-        self._body = RotorPyBody(
-            self._start,
-            args.yaw,
-            np.radians(limits.MPC_YAWRAUTO_MAX),
-            limits.MPC_ACC_HOR_MAX,
-            max_tilt_rad=np.radians(limits.MPC_TILTMAX_AIR),
-            wind=args.wind,
-        )
+        turn = np.radians(limits.MPC_YAWRAUTO_MAX)
+        self._body = RotorPyBody(self._start, args.yaw, turn, wind=args.wind, **limits.of_body())
         self._random = np.random.default_rng(args.seed)
         self._drift, self._battery = np.zeros(3), args.battery
         self._wires = [connect(address, 1, 1) for address in args.mavlink]

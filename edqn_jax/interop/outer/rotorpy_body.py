@@ -15,13 +15,17 @@ from edqn_jax.interop.outer.poses import Body
 STEP_S = 0.005
 """How often RotorPy's controller acts."""
 
+GRAVITY_M_S2 = 9.81
+
 
 class RotorPyBody:
     """RotorPy's Hummingbird, hovering at first.
 
     The controller's reference position is where the drone is, so that it follows the velocity alone: in proportion,
     since it has no integral part, and drag takes its share. It knows no limit of acceleration: a velocity that jumps
-    by 8 m/s tilts the drone by 80 degrees and turns it by up to 180, so the reference changes by `setpoint_m_s2`.
+    by 8 m/s tilts the drone by 80 degrees and turns it by up to 180, so the reference changes by `setpoint_m_s2`. Nor
+    does it keep the thrust upwards: a descent that is faster than a fall turns the drone upside down, unless its tilt
+    is limited as an autopilot limits it.
     """
 
     def __init__(
@@ -31,7 +35,8 @@ class RotorPyBody:
         max_yaw_rate: float,
         setpoint_m_s2: float,
         *,
-        max_tilt_rad: float = np.pi / 2,
+        max_tilt_rad: float | None = None,
+        least_thrust: float = 0.0,
         wind: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         """Prepares a drone at rest.
@@ -41,7 +46,9 @@ class RotorPyBody:
             yaw: radians from x to the left.
             max_yaw_rate: of its setpoint, rad/s.
             setpoint_m_s2: how fast the velocity changes that the controller is given, as an autopilot limits it.
-            max_tilt_rad: of what is asked of the controller.
+            max_tilt_rad: of the thrust that is asked of the controller; None: it asks for any.
+            least_thrust: that is kept upwards where the tilt is limited, as a share of the weight; comes before
+                what is asked sideways.
             wind: [3] m/s.
 
         Raises:
@@ -51,7 +58,7 @@ class RotorPyBody:
         control = require_extra("rotorpy.controllers.quadrotor_control", extra="fly")
         params = require_extra("rotorpy.vehicles.hummingbird_params", extra="fly").quad_params
         self._control = control.SE3Control(params)
-        hover = np.sqrt(params["mass"] * 9.81 / 4 / params["k_eta"])
+        hover = np.sqrt(params["mass"] * GRAVITY_M_S2 / 4 / params["k_eta"])
         self._state: dict[str, Any] = {
             "x": np.array(start, np.float64),
             "v": np.zeros(3),
@@ -64,7 +71,7 @@ class RotorPyBody:
             self._vehicle = vehicles.Multirotor(params, self._state, control_abstraction="cmd_motor_speeds")
         self._yaw, self._max_yaw_rate = yaw, max_yaw_rate
         self._velocity, self._setpoint_m_s2 = np.zeros(3), setpoint_m_s2
-        self._most_error = 9.81 * np.tan(max_tilt_rad) / self._control.kd_pos[0]
+        self._max_tilt_rad, self._least_thrust = max_tilt_rad, least_thrust
 
     def state(self) -> Body:
         """Returns position, attitude, velocity and yaw rate now."""
@@ -86,7 +93,7 @@ class RotorPyBody:
         self._velocity = self._velocity + change * min(1.0, self._setpoint_m_s2 * STEP_S / size)
         wanted = {
             "x": self._state["x"],
-            "x_dot": self._within_tilt(self._velocity),
+            "x_dot": self._within_limits(self._velocity),
             "x_ddot": np.zeros(3),
             "yaw": self._yaw,
             "yaw_dot": 0.0,
@@ -94,11 +101,14 @@ class RotorPyBody:
         control = self._control.update(0.0, self._state, wanted)
         self._state = self._vehicle.step(self._state, control, STEP_S)
 
-    def _within_tilt(self, velocity: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the nearest velocity whose error leans the drone no further than its largest tilt."""
-        error = velocity - self._state["v"]
-        across = float(np.linalg.norm(error[:2]))
-        if across <= self._most_error:
+    def _within_limits(self, velocity: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the nearest velocity whose error asks for a thrust within the limits, its vertical part first."""
+        if self._max_tilt_rad is None:
             return velocity
-        error = error * [self._most_error / across, self._most_error / across, 1.0]
+        gain = self._control.kd_pos
+        error = velocity - self._state["v"]
+        upwards = max(gain[2] * error[2] + GRAVITY_M_S2, self._least_thrust * GRAVITY_M_S2)
+        across = max(float(np.linalg.norm(gain[:2] * error[:2])), 1e-9)
+        share = min(1.0, np.tan(self._max_tilt_rad) * upwards / across)
+        error = np.array([share * error[0], share * error[1], (upwards - GRAVITY_M_S2) / gain[2]])
         return self._state["v"] + error
