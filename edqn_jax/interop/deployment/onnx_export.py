@@ -47,8 +47,9 @@ INPUTS, OUTPUTS = ("counts", "own", "motion", "memory"), ("values", "memory_afte
 OPSET, IR_VERSION = 18, 8
 """The oldest that this network can be written in, so that onnxruntime reads it from `runner.OLDEST_ONNXRUNTIME` on."""
 
-TOLERANCE = 1e-5
-"""Largest difference between a value of the Q-network in JAX and in ONNX, of the largest value where that exceeds 1."""
+TOLERANCE = 3e-5
+"""Largest difference between a value of the Q-network in double precision and in ONNX, of the largest value where that
+exceeds 1. Single precision alone makes up to 1e-5 of the packaged policies, a weight that is not the policy's more."""
 
 CHECKS = 1000
 """Random inputs that are compared before a policy is written."""
@@ -324,8 +325,8 @@ def _compare(policy: Policy, model: bytes, checks: int) -> tuple[float, int]:
         recalled = float(np.abs(memory - remembered).max())
         if not (difference <= most and recalled <= TOLERANCE * max(1.0, float(np.abs(remembered).max()))):
             raise CheckError(
-                f"ONNX and JAX differ by {max(difference, recalled):.1e} at random input {number}, more than "
-                f"{most:.1e}; nothing was written"
+                f"ONNX and JAX differ by {max(difference, recalled):.2e} at random input {number}, more than "
+                f"{most:.2e}; nothing was written"
             )
         second, first = np.sort(wanted[0])[-2:]
         tie = first - second <= 2 * most
