@@ -3,9 +3,9 @@ r"""Makes a policy that comes with the package: trains five seeds, measures the 
     python scripts/pretrain.py --run runs/pretrained --out edqn_jax/policies/pretrained
     python scripts/pretrain.py --kind looks --run runs/looks --out runs/looks-first
     python scripts/pretrain.py --kind further --start-from runs/looks-first --run runs/further \
+        --out runs/looks-further
+    python scripts/pretrain.py --kind autopilot --world narrow --start-from runs/looks-further --run runs/autopilot \
         --out edqn_jax/policies/pretrained-looks
-    python scripts/pretrain.py --kind autopilot --world narrow --start-from edqn_jax/policies/pretrained-looks \
-        --run runs/autopilot --out runs/autopilot-policy
     python scripts/pretrain.py --kind body --start-from runs/looks-first --run runs/body \
         --out edqn_jax/policies/pretrained-body
 
@@ -79,7 +79,7 @@ KINDS: dict[str, tuple[int, tuple[str, ...]]] = {
     "plaid": (0, ("--surface.pattern", "plaid")),
     "looks": (220_000_000, LOOKS),
     "further": (185_000_000, (*LOOKS, *AGAIN, "--encoder.retrain-at", "0.05", "0.35")),
-    "autopilot": (340_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, "--encoder.retrain-at", "0.05", "0.35")),
+    "autopilot": (370_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, "--encoder.retrain-at", "0.05", "0.35")),
     "body": (230_000_000, (*LOOKS, *AGAIN, *BODY, "--encoder.retrain-at", "0.06", "0.3")),
 }
 """Decisions of each seed, 0 as `DECISIONS`, and further options, by the kind of policy: of one plaid, of any look, the

@@ -29,6 +29,10 @@ Ending = Literal["hover", "hold", "land"]
 OF_THE_WORLD = "mavlink events fov calibration contrast goal volume fence origin goal_radius max_s dry clock".split()
 """Options that a simulated flight has from its world."""
 
+SIMULATED_LEAST_RATE = 0.001
+"""Default of --least-rate with --simulate, whose camera has no noise: blank worlds show it 0.003 events a pixel and
+second, a covered lens none."""
+
 OF_THE_LOG = ("fov", "contrast")
 """Options that a flight's log holds, where they are not given once more."""
 
@@ -99,8 +103,9 @@ class FlyArgs:
     """What is done about a fault, hover, hold or land, as in "low battery=hold"; docs/deployment.md has their names."""
     max_s: Annotated[float, arg(metavar="S")] = 300.0
     """Longest flight, seconds."""
-    least_rate: Annotated[float, arg(metavar="HZ")] = 0.1
-    """Events per second and pixel that a drone in motion sees at least; set it above the camera's noise."""
+    least_rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="")] = None
+    """Events per second and pixel that a drone in motion sees at least; set it above the camera's noise. 0.1, or 0.001
+    with --simulate, whose camera has no noise."""
     dry: bool = False
     """Bench test with props off: decides and logs, sends zero velocity, asks for no mode."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
@@ -315,7 +320,7 @@ def settings_of(args: FlyArgs, size: tuple[int, int], period_s: float) -> Settin
             after_hover=Action(args.after_hover),
             at_goal=Action(args.at_goal),
             flight_s=args.max_s,
-            limits=Limits(covered_hz=args.least_rate),
+            limits=Limits() if args.least_rate is None else Limits(covered_hz=args.least_rate),
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
@@ -384,7 +389,8 @@ def simulate(args: FlyArgs) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
         size = (346, 260) if args.camera is None else args.camera
-        answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal, "--least-rate", repr(args.least_rate)]
+        least = SIMULATED_LEAST_RATE if args.least_rate is None else args.least_rate
+        answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal, "--least-rate", repr(least)]
         more = (*answers, *(("--on", *args.on) if args.on else ()))
         setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace, autopilot=more)
         flown = fly_missions(environment, setup) if args.jobs == 1 else fly_at_once(*asked, setup, jobs=args.jobs)
