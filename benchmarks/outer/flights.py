@@ -16,8 +16,8 @@ from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics import drone
 
 KINDS = ("own", "rotorpy", "rotorpy-px4", "rotorpy-steps")
-"""Who flies. `rotorpy-px4`: with PX4's limits of acceleration, tilt and thrust, the vehicle of `edqn fly --simulate`.
-`rotorpy-steps`: its controller's setpoint jumps with each command."""
+"""Who flies. `rotorpy-px4`: with PX4's limits of acceleration, tilt and least thrust, the vehicle of
+`edqn fly --simulate`. `rotorpy-steps`: its controller's setpoint jumps with each command."""
 
 SETPOINT_M_S2 = 8.0
 """How fast the velocity changes that RotorPy's controller is given, as an autopilot limits it."""

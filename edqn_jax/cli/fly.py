@@ -31,7 +31,7 @@ OF_THE_WORLD = "mavlink events fov calibration contrast goal volume fence origin
 
 SIMULATED_LEAST_RATE = 0.001
 """Default of --least-rate with --simulate, whose camera has no noise: blank worlds show it 0.003 events a pixel and
-second, a covered lens none."""
+second, or none, a covered lens none."""
 
 OF_THE_LOG = ("fov", "contrast")
 """Options that a flight's log holds, where they are not given once more."""
@@ -320,7 +320,7 @@ def settings_of(args: FlyArgs, size: tuple[int, int], period_s: float) -> Settin
             after_hover=Action(args.after_hover),
             at_goal=Action(args.at_goal),
             flight_s=args.max_s,
-            limits=Limits() if args.least_rate is None else Limits(covered_hz=args.least_rate),
+            limits=Limits(covered_hz=least_rate_of(args)),
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
@@ -356,6 +356,15 @@ def replay(args: FlyArgs, folder: Path) -> None:
         raise CheckError(f"the flight in '{folder}' goes another way once more")
 
 
+def least_rate_of(args: FlyArgs) -> float:
+    """Returns the least rate of events, Hz a pixel: what is asked for, or the default of such cameras."""
+    if args.least_rate is not None:
+        return args.least_rate
+    from edqn_jax.fly.faults import Limits
+
+    return Limits.covered_hz if args.simulate is None else SIMULATED_LEAST_RATE
+
+
 def simulate(args: FlyArgs) -> None:
     """Flies missions here, over the wire."""
     import os
@@ -389,8 +398,8 @@ def simulate(args: FlyArgs) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
         size = (346, 260) if args.camera is None else args.camera
-        least = SIMULATED_LEAST_RATE if args.least_rate is None else args.least_rate
-        answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal, "--least-rate", repr(least)]
+        least = repr(least_rate_of(args))
+        answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal, "--least-rate", least]
         more = (*answers, *(("--on", *args.on) if args.on else ()))
         setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace, autopilot=more)
         flown = fly_missions(environment, setup) if args.jobs == 1 else fly_at_once(*asked, setup, jobs=args.jobs)

@@ -72,7 +72,7 @@ def test_its_script_trains_with_its_options(name: str, monkeypatch: pytest.Monke
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
     options = edqn_jax.load_policy(name).config
     script = import_module("pretrain")
-    words = script.options_of(options.world.name, {PRETRAINED: "plaid", LOOKS: "further", BODY: "body"}[name])
+    words = script.options_of(options.world.name, {PRETRAINED: "plaid", LOOKS: "autopilot", BODY: "body"}[name])
     _, asked = parse_train(words)
     if name != PRETRAINED:  # began with a policy of any look
         assert parse_train([*words, "--start-from", LOOKS])[1] == asked

@@ -17,14 +17,17 @@ OFFBOARD, HOLD, LAND, POSITION = (6, 0), (4, 3), (4, 6), (3, 0)
 
 @dataclasses.dataclass(frozen=True)
 class Limits:
-    """Parameters of PX4 with their defaults, but for the last three, which a policy of 4 m/s needs so."""
+    """Parameters of PX4 with their defaults, but for the last three, which a policy of 4 m/s needs so.
+
+    Largest thrust, jerk and accelerations up and down have no limits of their own here.
+    """
 
     COM_OF_LOSS_T: float = 0.5
     """Seconds without a setpoint after which offboard mode is left."""
     MPC_XY_VEL_MAX: float = 12.0
     """m/s."""
     MPC_ACC_HOR_MAX: float = 5.0
-    """m/s², here of the velocity's change in any direction."""
+    """m/s², here of the held velocity's change in any direction; PX4's is of level flight."""
     MPC_TILTMAX_AIR: float = 45.0
     """Degrees."""
     MPC_THR_MIN: float = 0.12

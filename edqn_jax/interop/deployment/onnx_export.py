@@ -49,7 +49,7 @@ OPSET, IR_VERSION = 18, 8
 
 TOLERANCE = 3e-5
 """Largest difference between a value of the Q-network in double precision and in ONNX, of the largest value where that
-exceeds 1. Single precision alone makes up to 1e-5 of the packaged policies, a weight that is not the policy's more."""
+exceeds 1. Single precision alone differs by up to 1e-5 in the packaged policies; a wrong weight differs by more."""
 
 CHECKS = 1000
 """Random inputs that are compared before a policy is written."""

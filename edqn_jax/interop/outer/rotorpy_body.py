@@ -102,7 +102,7 @@ class RotorPyBody:
         self._state = self._vehicle.step(self._state, control, STEP_S)
 
     def _within_limits(self, velocity: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the nearest velocity whose error asks for a thrust within the limits, its vertical part first."""
+        """Returns a velocity whose error asks for a thrust within the limits; sideways gives way to upwards."""
         if self._max_tilt_rad is None:
             return velocity
         gain = self._control.kd_pos
