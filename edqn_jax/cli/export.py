@@ -24,7 +24,7 @@ class ExportArgs:
     out: Annotated[Path, arg(metavar="FILE.onnx")]
     """File to write; it replaces one of that name."""
     checks: Annotated[int, arg(metavar="N")] = 1000
-    """Random inputs on which ONNX and JAX must choose the same moves, with values that agree to 3e-5 of the largest."""
+    """Random inputs on which ONNX and JAX must choose the same moves, with values that agree to 1e-5 of the largest."""
 
 
 def parse_export(argv: Sequence[str]) -> ExportArgs:

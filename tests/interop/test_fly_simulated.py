@@ -72,8 +72,7 @@ def test_a_mission_is_flown_over_the_wire_and_its_log_goes_the_same_way_once_mor
     world = tmp_path / "easy.xml"
     world.write_text(EASY)
     environment = environment_of(str(world), load_policy("pretrained-looks").config, 1, 0)
-    setup = Setup(exported, SIZE, frame_s=0.01, out=tmp_path, pace=0.5)
-    flown = fly_mission(environment, 0, setup)
+    flown = fly_mission(environment, 0, Setup(exported, out=tmp_path))  # the camera that it learnt with
     assert flown.outcome == "goal" and flown.clearance_m > 0.0 and flown.events_hz > 0.0
     assert flown.latency["computing"][0] > 0.0
     folder = tmp_path / "mission-0"

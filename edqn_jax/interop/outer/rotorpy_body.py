@@ -15,8 +15,6 @@ from edqn_jax.interop.outer.poses import Body
 STEP_S = 0.005
 """How often RotorPy's controller acts."""
 
-GRAVITY_M_S2 = 9.81
-
 
 class RotorPyBody:
     """RotorPy's Hummingbird, hovering at first.
@@ -58,7 +56,7 @@ class RotorPyBody:
         control = require_extra("rotorpy.controllers.quadrotor_control", extra="fly")
         params = require_extra("rotorpy.vehicles.hummingbird_params", extra="fly").quad_params
         self._control = control.SE3Control(params)
-        hover = np.sqrt(params["mass"] * GRAVITY_M_S2 / 4 / params["k_eta"])
+        hover = np.sqrt(params["mass"] * self._control.g / 4 / params["k_eta"])
         self._state: dict[str, Any] = {
             "x": np.array(start, np.float64),
             "v": np.zeros(3),
@@ -105,10 +103,10 @@ class RotorPyBody:
         """Returns a velocity whose error asks for a thrust within the limits; sideways gives way to upwards."""
         if self._max_tilt_rad is None:
             return velocity
-        gain = self._control.kd_pos
+        gain, weight = self._control.kd_pos, self._control.g  # thrusts per mass
         error = velocity - self._state["v"]
-        upwards = max(gain[2] * error[2] + GRAVITY_M_S2, self._least_thrust * GRAVITY_M_S2)
+        upwards = max(gain[2] * error[2] + weight, self._least_thrust * weight)
         across = max(float(np.linalg.norm(gain[:2] * error[:2])), 1e-9)
         share = min(1.0, np.tan(self._max_tilt_rad) * upwards / across)
-        error = np.array([share * error[0], share * error[1], (upwards - GRAVITY_M_S2) / gain[2]])
+        error = np.array([share * error[0], share * error[1], (upwards - weight) / gain[2]])
         return self._state["v"] + error
