@@ -182,7 +182,7 @@ def _decide(policy: Any, inputs: list[np.ndarray], options: dict[str, Any]) -> T
 
 
 def _exactly(policy: Any, inputs: list[np.ndarray]) -> Tree:
-    return onnx_export._values_in_float64(policy, [inputs])
+    return onnx_export._values_by_jax(policy, [inputs], np.float64)
 
 
 def _policy_inputs(config: Config, count: int) -> list[np.ndarray]:
