@@ -29,10 +29,6 @@ Ending = Literal["hover", "hold", "land"]
 OF_THE_WORLD = "mavlink events fov calibration contrast goal volume fence origin goal_radius max_s dry clock".split()
 """Options that a simulated flight has from its world."""
 
-SIMULATED_LEAST_RATE = 0.001
-"""Default of --least-rate with --simulate, whose camera has no noise: blank worlds show it 0.003 events a pixel and
-second, or none, a covered lens none."""
-
 OF_THE_LOG = ("fov", "contrast")
 """Options that a flight's log holds, where they are not given once more."""
 
@@ -103,9 +99,11 @@ class FlyArgs:
     """What is done about a fault, hover, hold or land, as in "low battery=hold"; docs/deployment.md has their names."""
     max_s: Annotated[float, arg(metavar="S")] = 300.0
     """Longest flight, seconds."""
-    least_rate: Annotated[float | None, arg(metavar="HZ", help_behavior_hint="")] = None
-    """Events per second and pixel that a drone in motion sees at least; set it above the camera's noise. 0.1, or 0.001
-    with --simulate, whose camera has no noise."""
+    least_rate: Annotated[float, arg(metavar="HZ")] = 0.1
+    """Events per second and pixel that a drone in motion sees through an open lens; set it above the camera's noise.
+    A lens that sees fewer for 0.4 s after the whole picture went dark, or from the start on, is covered."""
+    unseen_s: Annotated[float, arg(metavar="S")] = 8.0
+    """So long a lens that did not go dark may see fewer, as before blank walls; longer with a slower --pace."""
     dry: bool = False
     """Bench test with props off: decides and logs, sends zero velocity, asks for no mode."""
     out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
@@ -136,6 +134,8 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
         raise ConfigError("--fov and --calibration cannot both be given: a calibration says the field of view")
     if not 0.2 <= args.pace <= 1.0:
         raise ConfigError(f"--pace must be from 0.2 to 1, not {args.pace:g}")
+    if args.least_rate < 0 or args.unseen_s <= 0:
+        raise ConfigError("--least-rate must be at least 0 and --unseen-s more than 0")
     actions_of(args.on)
     if args.json is not None:
         check_can_write(args.json)
@@ -320,7 +320,7 @@ def settings_of(args: FlyArgs, size: tuple[int, int], period_s: float) -> Settin
             after_hover=Action(args.after_hover),
             at_goal=Action(args.at_goal),
             flight_s=args.max_s,
-            limits=Limits(covered_hz=least_rate_of(args)),
+            limits=Limits(covered_hz=args.least_rate, unseen_s=args.unseen_s / args.pace),
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
@@ -356,15 +356,6 @@ def replay(args: FlyArgs, folder: Path) -> None:
         raise CheckError(f"the flight in '{folder}' goes another way once more")
 
 
-def least_rate_of(args: FlyArgs) -> float:
-    """Returns the least rate of events, Hz a pixel: what is asked for, or the default of such cameras."""
-    if args.least_rate is not None:
-        return args.least_rate
-    from edqn_jax.fly.faults import Limits
-
-    return Limits.covered_hz if args.simulate is None else SIMULATED_LEAST_RATE
-
-
 def simulate(args: FlyArgs) -> None:
     """Flies missions here, over the wire."""
     import os
@@ -398,9 +389,9 @@ def simulate(args: FlyArgs) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
         size = (346, 260) if args.camera is None else args.camera
-        least = repr(least_rate_of(args))
-        answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal, "--least-rate", least]
-        more = (*answers, *(("--on", *args.on) if args.on else ()))
+        answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal]
+        limits = ["--least-rate", repr(args.least_rate), "--unseen-s", repr(args.unseen_s)]
+        more = (*answers, *limits, *(("--on", *args.on) if args.on else ()))
         setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace, autopilot=more)
         flown = fly_missions(environment, setup) if args.jobs == 1 else fly_at_once(*asked, setup, jobs=args.jobs)
         show_phase("flying", 0, args.missions)

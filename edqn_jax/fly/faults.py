@@ -92,6 +92,8 @@ class Inputs:
     """When the newest packet of the camera came, with events or without."""
     rate_hz: float = 0.0
     """Events per second over the last 100 ms."""
+    darkening: float = 0.0
+    """OFF events less ON ones, a pixel of the camera, over the last 200 ms."""
     camera: tuple[int, int] | None = None
     """Width and height that the camera says it has."""
     battery: float | None = None
@@ -115,9 +117,14 @@ class Limits:
     """Without a packet of the camera."""
     burst_hz: float = 1e7
     covered_hz: float = 0.1
-    """Events per second and pixel of the camera that a drone in motion sees at least."""
+    """Events per second and pixel of the camera that a drone in motion sees at least through an open lens."""
+    darkening: float = 2.0
+    """OFF events less ON ones, a pixel and 200 ms, from which on the whole picture has gone dark: at a contrast of 0.2
+    to two thirds of its brightness. Flights through open worlds come to 0.8, a covered lens to 10 and more."""
     covered_s: float = 0.4
-    """For so long there must be fewer."""
+    """So long a lens that went dark, or has seen nothing yet, sees too little before it is called covered."""
+    unseen_s: float = 8.0
+    """So long one that did not: blank walls, the ground and the sky show a good lens nothing for 6 s."""
     moving_m_s: float = 1.0
     """Slower ones may see nothing."""
     late_s: float = 0.1
@@ -145,6 +152,10 @@ class Watch:
     drifted: bool = False
     seen_at: float | None = None
     """When the camera last saw enough, or the drone was too slow to see anything."""
+    dark_at: float | None = None
+    """When the whole picture last went dark."""
+    is_open: bool = False
+    """Whether the camera has seen enough since it last went dark, so that to see nothing is no sign of a cover."""
 
 
 def watch(before: Watch, inputs: Inputs, now: float, limits: Limits) -> Watch:
@@ -181,9 +192,15 @@ def watch(before: Watch, inputs: Inputs, now: float, limits: Limits) -> Watch:
 def _seeing(before: Watch, inputs: Inputs, now: float, limits: Limits) -> Watch:
     pixels = 1 if inputs.camera is None else inputs.camera[0] * inputs.camera[1]
     moves = inputs.odometry is not None and float(np.linalg.norm(inputs.odometry.velocity)) > limits.moving_m_s
-    if before.seen_at is not None and moves and inputs.rate_hz < limits.covered_hz * pixels:
-        return before
-    return dataclasses.replace(before, seen_at=now)
+    sees, darkens = inputs.rate_hz >= limits.covered_hz * pixels, inputs.darkening >= limits.darkening
+    # What is seen soon after it went dark may be the end of its going dark.
+    opens = sees and (before.dark_at is None or now - before.dark_at > limits.covered_s)
+    return dataclasses.replace(
+        before,
+        seen_at=before.seen_at if before.seen_at is not None and moves and not sees else now,
+        dark_at=now if darkens else before.dark_at,
+        is_open=not darkens and (before.is_open or opens),
+    )
 
 
 def faults_of(watched: Watch, inputs: Inputs, now: float, settings: Settings) -> Iterator[Fault]:
@@ -203,7 +220,7 @@ def faults_of(watched: Watch, inputs: Inputs, now: float, settings: Settings) ->
         Fault.DRIFT: watched.drifted,
         Fault.NO_EVENTS: is_old(inputs.packet_at, now, limits.silent_s),
         Fault.BURST: inputs.rate_hz > limits.burst_hz,
-        Fault.COVERED: watched.seen_at is not None and now - watched.seen_at > limits.covered_s,
+        Fault.COVERED: is_old(watched.seen_at, now, limits.unseen_s if watched.is_open else limits.covered_s),
     }
     yield from (fault for fault in Fault if found.get(fault))
 

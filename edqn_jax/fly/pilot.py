@@ -229,6 +229,7 @@ class Pilot:
             **(self._pretended() if self._dry else {}),
             packet_at=events.packet_at,
             rate_hz=events.rate_hz(self.clock.now()),
+            darkening=events.darkening(self.clock.now()),
             camera=events.size,
             stop=self._stop(),
             command=self._command,

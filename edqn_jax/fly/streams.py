@@ -32,6 +32,9 @@ PACKET = struct.Struct("<qI")
 RATE_S = 0.1
 """The rate of events is counted over so long."""
 
+DARKENING_S = 0.2
+"""Likewise how much darker the picture has become."""
+
 START_S = 5.0
 """Longest that a camera takes to answer."""
 
@@ -55,6 +58,7 @@ class Events:
         """Of the camera's clock."""
         self._keep_us = keep_us
         self._packets: collections.deque[tuple[float, int, NDArray]] = collections.deque()
+        self._darkenings: collections.deque[tuple[float, int]] = collections.deque()
 
     def add(self, events: NDArray, until_us: int, at: float) -> None:
         """Takes a packet of events [N] that came at a time of the host's clock."""
@@ -65,6 +69,9 @@ class Events:
         if until_us < self.until_us:  # the camera's clock began anew
             self._packets.clear()
         self.until_us, self.packet_at = until_us, at
+        self._darkenings.append((at, events.size - 2 * int(np.count_nonzero(events["p"] > 0))))
+        while self._darkenings[0][0] <= at - DARKENING_S:
+            self._darkenings.popleft()
         self.offset.add_arrival(1e-6 * until_us, at)
         self._packets.append((at, until_us, events))
         while self._packets[0][1] < until_us - self._keep_us:
@@ -94,6 +101,13 @@ class Events:
     def rate_hz(self, now: float) -> float:
         """Returns events per second of those that came in the last tenth of a second."""
         return sum(each.size for at, _, each in self._packets if at > now - RATE_S) / RATE_S
+
+    def darkening(self, now: float) -> float:
+        """Returns by how many OFF events, less ON ones, a pixel has become darker in the last fifth of a second."""
+        if self.size is None:
+            return 0.0
+        net = sum(net for at, net in self._darkenings if at > now - DARKENING_S)
+        return net / (self.size[0] * self.size[1])
 
 
 class EventSource(Protocol):

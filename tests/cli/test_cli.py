@@ -18,7 +18,7 @@ import pytest
 from edqn_jax.cli import commands, main, train
 from edqn_jax.cli.arguments import MEANINGS, flags_of
 from edqn_jax.cli.evaluate import EvaluateArgs, parse_evaluate
-from edqn_jax.cli.fly import least_rate_of, parse_fly, simulate
+from edqn_jax.cli.fly import parse_fly, simulate
 from edqn_jax.cli.help import COMMON, NAMED, flag_of
 from edqn_jax.cli.train import parse_train, train_flags
 from edqn_jax.config import Config, get_preset
@@ -346,12 +346,6 @@ def test_a_simulated_flights_world_is_looked_at_before_its_packages(monkeypatch)
         simulate(args)
     with pytest.raises(ImportError):
         simulate(dataclasses.replace(args, simulate="rooms"))
-
-
-@pytest.mark.parametrize("asked, rate", [({"simulate": None}, 0.1), ({}, 0.001), ({"least_rate": 0.2}, 0.2)])
-def test_a_simulated_lens_is_covered_only_where_it_sees_almost_nothing(asked, rate):
-    args = parse_fly(["pretrained-looks", "--simulate", "rooms"])
-    assert least_rate_of(dataclasses.replace(args, **asked)) == rate
 
 
 def test_help_all_lists_every_option_and_does_not_start_jax():

@@ -36,6 +36,12 @@ def aged(inputs: Inputs, since: float) -> Inputs:
     return dataclasses.replace(inputs, odometry=dataclasses.replace(own, at=own.at - since - TICK_S))
 
 
+def covered(inputs: Inputs, since: float) -> Inputs:
+    """Covers the lens within 50 ms: 23 OFF events a pixel, as of a hundredth of the light; then noise alone."""
+    darkening, rate_hz = (20.0, 9e6) if since < 0.05 else (20.0 * (since < 0.2), 200.0)
+    return dataclasses.replace(inputs, darkening=darkening, rate_hz=rate_hz)
+
+
 FAULTS: dict[Fault, tuple[Change, float]] = {
     Fault.STOPPED: (lambda now, since: dataclasses.replace(now, stop=True), 0.0),
     Fault.SECOND_MASTER: (lambda now, since: dataclasses.replace(now, other_master=True), 0.0),
@@ -51,7 +57,7 @@ FAULTS: dict[Fault, tuple[Change, float]] = {
     Fault.DRIFT: (lambda now, since: moved(now, (0.0, since, 0.0)), 2.5),
     Fault.NO_EVENTS: (lambda now, since: dataclasses.replace(now, packet_at=(now.packet_at or 0.0) - since), 0.12),
     Fault.BURST: (lambda now, since: dataclasses.replace(now, rate_hz=2e7), 0.0),
-    Fault.COVERED: (lambda now, since: dataclasses.replace(now, rate_hz=200.0), 0.42),
+    Fault.COVERED: (covered, 0.48),
 }
 """What each fault does, and how soon it must be noticed, seconds."""
 
@@ -97,6 +103,41 @@ def test_a_flight_goes_on_after_a_passing_fault(fault: Fault) -> None:
 def test_a_flight_does_not_go_on_after_another_fault(fault: Fault) -> None:
     flown = fly(settings(), FAULTS[fault][0], 5.0, lasts=2.5)
     assert flown.state.phase is Phase.ENDED and flown.state.outcome == fault
+
+
+def test_an_open_lens_may_see_nothing_before_blank_walls_for_longer_than_a_covered_one() -> None:
+    def blank(inputs: Inputs, since: float) -> Inputs:
+        return dataclasses.replace(inputs, rate_hz=200.0, darkening=0.8 * (since < 0.2))
+
+    far = settings(goal=np.array([99.0, 5.0, 6.0]))
+    assert fly(far, blank, 5.0, lasts=7.0).state.outcome == "goal"
+    flown = fly(far, blank, 5.0)
+    assert flown.state.outcome == Fault.COVERED
+    assert not flown.moves_after(5.0 + far.limits.unseen_s + 2 * TICK_S)
+    assert flown.moves_after(5.0 + far.limits.unseen_s - 2 * TICK_S)
+
+
+def test_a_lens_that_was_covered_before_the_flight_is_noticed() -> None:
+    flown = fly(settings(), lambda inputs, since: dataclasses.replace(inputs, rate_hz=0.0), 0.0)
+    assert flown.state.outcome == Fault.COVERED
+    begun = flown.times[flown.phases.index(Phase.FLYING)]
+    assert not flown.moves_after(begun + 1.5)
+
+
+def test_a_shade_that_is_flown_into_is_no_cover() -> None:
+    def shade(inputs: Inputs, since: float) -> Inputs:
+        return dataclasses.replace(inputs, darkening=5.0 * (since < 0.3), rate_hz=200.0 if 2.0 < since < 4.0 else 2e5)
+
+    assert fly(settings(), shade, 5.0).state.outcome == "goal"
+
+
+def test_a_cover_that_closes_slowly_is_one() -> None:
+    def closes(inputs: Inputs, since: float) -> Inputs:
+        darkening = 8.0 if since < 0.6 else 8.0 * max(0.0, 0.8 - since) / 0.2
+        return dataclasses.replace(inputs, darkening=darkening, rate_hz=4e6 if since < 0.7 else 200.0)
+
+    flown = fly(settings(), closes, 5.0)
+    assert flown.state.outcome == Fault.COVERED and not flown.moves_after(5.7 + 0.5)
 
 
 def test_a_passing_fault_that_comes_back_ends_the_flight() -> None:

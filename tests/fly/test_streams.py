@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.fly.simulated.camera import EventServer
+from edqn_jax.fly.simulated.camera import EventCamera, EventServer
 from edqn_jax.fly.streams import (
     EVENT,
     HEADER,
@@ -127,3 +127,19 @@ def test_a_recording_is_played_at_its_own_speed_and_then_silent(tmp_path) -> Non
 
     write_events(tmp_path / "a.npz", Recording(source._events, 64, 48))
     assert open_events(str(tmp_path / "a.npz")).events.size == (64, 48)
+
+
+def test_a_lens_that_is_covered_darkens_the_whole_picture_and_a_moving_scene_does_not() -> None:
+    rng = np.random.default_rng(3)
+    scene = np.exp(0.5 * rng.normal(size=(48, 400)))
+    camera = EventCamera(lambda place, _: scene[:, int(place[0]) : int(place[0]) + 64] * place[1], lambda _: np.eye(3))
+    events, light, seen = Events((64, 48)), 1.0, []
+    for k in range(120):
+        light = light if k < 80 else max(0.01, 0.5 * light)  # from 0.4 s on it is covered within 35 ms
+        until, new = camera.frame(0.005 * k, np.array([2.0 * k, light, 0.0]), np.zeros(4))
+        events.add(new, until, 0.005 * k)
+        seen.append(events.darkening(0.005 * k))
+    assert np.abs(seen[:80]).max() < 0.8
+    assert max(seen) == pytest.approx(np.log(100) / 0.2, abs=1.0)
+    assert events.darkening(0.9) == 0.0
+    assert Events().darkening(0.0) == 0.0
