@@ -1,6 +1,7 @@
 """Are the outcomes right? Replays a run's flights in C MuJoCo, which shares no code with our distances.
 
-Prints for each outcome how many flights C MuJoCo confirms: a contact at the stated time for a collision, and no contact
+Meshes that are not convex, and height fields, are judged by trimesh's distances: MuJoCo takes a mesh for its hull.
+Prints for each outcome how many flights the judge confirms: a contact at the stated time for a collision, and no contact
 for any other outcome. The exit code is 1 if one outcome differs.
 
     python benchmarks/verdicts.py RUN --missions 200
@@ -36,6 +37,7 @@ def rows_of(results: list[Agreement]) -> list[dict[str, Any]]:
             {
                 "name": outcome.name.lower(),
                 "flights": len(same),
+                "judge": " and ".join(sorted({result.judge for result in same})),
                 "agree": sum(result.agrees for result in same),
                 "contacts_found": sum(result.found is not None for result in same),
                 "apart_m_largest": float(np.max(apart)) if apart else None,
@@ -47,13 +49,13 @@ def rows_of(results: list[Agreement]) -> list[dict[str, Any]]:
 def table(rows: list[dict[str, Any]]) -> str:
     """Returns the rows as a Markdown table."""
     lines = [
-        "| our outcome | flights | C MuJoCo agrees | contacts it finds | largest difference, mm |",
-        "| --- | ---: | ---: | ---: | ---: |",
+        "| our outcome | flights | judge | agrees | contacts it finds | largest difference, mm |",
+        "| --- | ---: | --- | ---: | ---: | ---: |",
     ]
     for row in rows:
         apart = "" if row["apart_m_largest"] is None else f"{1e3 * row['apart_m_largest']:.3f}"
         lines.append(
-            f"| {row['name'].replace('_', ' ')} | {row['flights']} | {row['agree']} "
+            f"| {row['name'].replace('_', ' ')} | {row['flights']} | {row['judge']} | {row['agree']} "
             f"| {row['contacts_found']} | {apart} |"
         )
     return "\n".join(lines)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -24,7 +24,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.extras import SINKS, require_extra
 from edqn_jax.report.style import OUTCOME_COLOURS
-from edqn_jax.report.worlds.solids import solids_of
+from edqn_jax.report.worlds.solids import solids_of_shape, standing_rows
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.loop import Chunk
 
@@ -191,19 +191,18 @@ class Rerun:
         self._stream.log("world/ends", self._rerun.Points3D([path[-1] for path in paths], colors=colours, radii=0.4))
 
     def _mesh(self, scene: Any) -> Any:
-        """Returns the solids of a world as one mesh."""
+        """Returns the solids of a world as one mesh; of a mesh that is not convex its own triangles."""
         corners, triangles, colours, count = [], [], [], 0
-        for solid in solids_of(scene):
-            for face in solid.faces:
-                corners.append(face)
-                colours.append(np.tile(np.round(255 * solid.colour).astype(np.uint8), (len(face), 1)))
-                triangles += [(count, count + k, count + k + 1) for k in range(1, len(face) - 1)]
-                count += len(face)
+        for points, rings, colour in surfaces_of(scene):
+            corners.append(points)
+            triangles.append(rings + count)
+            colours.append(np.tile(np.round(255 * colour).astype(np.uint8), (len(points), 1)))
+            count += len(points)
         if not corners:
             return self._rerun.Clear(recursive=False)
         return self._rerun.Mesh3D(
             vertex_positions=np.concatenate(corners),
-            triangle_indices=np.array(triangles),
+            triangle_indices=np.concatenate(triangles),
             vertex_colors=np.concatenate(colours),
         )
 
@@ -220,6 +219,20 @@ def numeric_metrics(metrics: Mapping[str, Any]) -> dict[str, float]:
         for name, value in metrics.items()
         if isinstance(value, int | float) and not isinstance(value, bool) and name != "decisions"
     }
+
+
+def surfaces_of(scene: Any) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Yields vertices [V, 3] in the world, triangles [T, 3] and colour [3] of what stands in a world."""
+    for kind, shape in standing_rows(scene):
+        drawn = {} if kind.page is None else kind.page(shape)
+        if drawn.get("kind") == "mesh":
+            turned = np.asarray(drawn["vertices"]) @ np.reshape(drawn["turn"], (3, 3)).T
+            yield shape.position + turned, np.asarray(drawn["triangles"]), np.asarray(shape.albedo)
+            continue
+        for solid in solids_of_shape(kind, shape):
+            for face in solid.faces:
+                fan = [(0, k, k + 1) for k in range(1, len(face) - 1)]
+                yield np.asarray(face), np.array(fan), solid.colour
 
 
 def _rgb(colour: str) -> list[int]:

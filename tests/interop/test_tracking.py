@@ -17,12 +17,14 @@ import pytest
 from edqn_jax.cli import main
 from edqn_jax.config import Config
 from edqn_jax.extras import require_extra
-from edqn_jax.interop.tracking import Rerun, Sinks, TensorBoard, Wandb
+from edqn_jax.interop.tracking import Rerun, Sinks, TensorBoard, Wandb, surfaces_of
+from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.history import EndedEpisodes
 from edqn_jax.training.loop import Chunk
 from edqn_jax.training.selection import Candidate
 from tests.support.box_flight import world_with_a_box
+from tests.support.meshes import bracket, mesh_world
 
 VALUES = {64: 1.5, 128: 2.5, 192: -3.0}
 """Mean return by decisions."""
@@ -145,6 +147,17 @@ def test_rerun_reads_metrics_and_flights_back(tmp_path: Path) -> None:
         (values,) = (name for name in batch.schema.names if "scalars" in name.lower())
         rows |= dict(zip(batch["decisions"].to_pylist(), batch[values].to_pylist(), strict=True))
     assert rows == {decisions: [value] for decisions, value in VALUES.items()}
+
+
+def test_rerun_shows_a_mesh_itself(tmp_path: Path) -> None:
+    vertices, faces = bracket()
+    scene = load_scene(
+        mesh_world(tmp_path, '<geom type="mesh" mesh="bracket" pos="9 5 3" euler="0 0 90"/>', bracket=(vertices, faces))
+    )
+    ((points, rings, _),) = surfaces_of(scene)
+    turned = np.stack([-vertices[:, 1], vertices[:, 0], vertices[:, 2]], axis=1) + [9, 5, 3]
+    # To the precision of MJCF's degrees.
+    np.testing.assert_allclose(points[rings].reshape(-1, 9), turned[faces].reshape(-1, 9), atol=1e-5)
 
 
 def test_a_sink_that_fails_is_left_out_with_one_warning(tmp_path: Path) -> None:

@@ -127,7 +127,7 @@ def _grid(vertices: bytes, faces: bytes, cell: float | None, thickness: float) -
         raise ConfigError(
             f"the mesh measures {' x '.join(f'{2 * side:.4g}' for side in half)} m, and its distances on a grid of "
             f"{cell:g} m would be {np.prod(_counts(half, cell)):,.0f} values; a mesh may have {MOST_VALUES:,}, so make "
-            "it of smaller ones, or of boxes"
+            "it of smaller ones, or of boxes, or, if its file is in millimetres, scale it by 0.001"
         )
     corners, rings = hull_of(given) if is_convex else (given, triangles)
     corners = corners - middle

@@ -146,7 +146,7 @@ BAD = {
     "nan.obj": "has a vertex that is not finite",
     "points.ply": "has no triangles; `edqn world` makes a world of points",
     "broken.ply": "cannot be read as .ply",
-    "open.stl": "geom 'thing': the mesh is not watertight",
+    "open.stl": "geom 'thing': the mesh is not watertight.*give it a thickness: <numeric",
     "turned.stl": "geom 'thing': the mesh is inside out",
 }
 

@@ -25,6 +25,9 @@ KINDS = ("obj", "stl", "ply", "msh")
 MAX_FILE_BYTES = 100_000_000
 """Of all files that a world names."""
 
+MOST_BYTES = 1_000_000_000
+"""Of a scan, which is read whole."""
+
 _HEADER = 10_000  # bytes that hold the counts of a file
 _STL_BYTES = 50  # of a triangle
 _FIELD_KINDS = ("png", "bin")
@@ -127,8 +130,13 @@ def load_geometry(file: Path, kind: str, most: int = MOST_TRIANGLES) -> Any:
     import trimesh
 
     try:
+        size = file.stat().st_size
+        if size > MOST_BYTES:
+            raise ConfigError(
+                f"the mesh file '{file}' has {size / 1e9:.1f} GB; it may have {MOST_BYTES / 1e9:g}, so simplify it"
+            )
         with file.open("rb") as opened:
-            check_number(file, _announced(opened.read(_HEADER), kind, file.stat().st_size), most)
+            check_number(file, _announced(opened.read(_HEADER), kind, size), most)
         content = io.BytesIO(file.read_bytes())
     except OSError as error:
         raise ConfigError(f"cannot read the mesh file '{file}': {error.strerror}") from None

@@ -18,6 +18,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.grid_boxes import boxes_of_grid, thinned
 from edqn_jax.sim.scene.mesh_field import Grid, grid_of_mesh, hull_of, spread_directions
 from edqn_jax.sim.scene.motion import Motion
@@ -260,7 +261,12 @@ def _repeat(step: Callable[[State], tuple[Array, State]], state: State) -> State
 def _read(geom: Geom) -> Fields | None:
     if geom.mesh is None:
         return None
-    grid, middle = grid_of_mesh(*geom.mesh, thickness=geom.thickness)
+    try:
+        grid, middle = grid_of_mesh(*geom.mesh, thickness=geom.thickness)
+    except ConfigError as error:
+        # Only the file that names it can make it a surface.
+        hint = f'; or give it a thickness: <numeric name="{THICKNESS}NAME OF THE GEOM" data="0.1"/> in <custom>'
+        raise ConfigError(f"{error}{hint if 'watertight' in str(error) else ''}") from None
     position = geom.position + geom.rotation @ middle
     return Fields(position, geom.rotation, grid.half, np.float32(0), geom.albedo, grids=(grid,))  # type: ignore[arg-type]
 
