@@ -191,7 +191,7 @@ def figures_table(figures: dict[str, Any]) -> Table:
     table.add_row("SPL", number(figures["spl"], "{:.3f}"))
     table.add_section()
     table.add_row("flights that reached the goal", "", style="bold")
-    table.add_row("path / shortest path", number(figures["path_over_shortest"], "{:.3f}"))
+    table.add_row("path / shortest path to the centre", number(figures["path_over_shortest"], "{:.3f}"))
     table.add_row("path", number(figures["path_length_m"], "{:.1f} m"))
     table.add_row("decisions", number(figures["decisions"], "{:.1f}"))
     table.add_row("flight time", number(figures["flight_seconds"], "{:.1f} s"))

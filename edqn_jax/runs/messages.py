@@ -102,7 +102,7 @@ def _of_one(summary: dict[str, Any], config: Config) -> str:
         f"reached the goal, after {_count(summary['parameters_from_decisions'], 'decision')} of training.\n"
         f"{_flight(summary)} {ending} after {_count(summary['steps'], 'decision')} "
         f"({summary['flight_seconds']:.1f} s): {summary['path_length_m']:.1f} m flown, "
-        f"shortest path {summary['shortest_path_m']:.1f} m. "
+        f"shortest path to the goal's centre {summary['shortest_path_m']:.1f} m. "
         f"{_nearest(summary)}"
     )
     if "test" in summary:

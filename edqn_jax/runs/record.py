@@ -33,6 +33,11 @@ from edqn_jax.training.setup import Display, TrainingSetup, set_up_training
 class Screen(Display, Protocol):
     """Interface of a progress display that also prints lines."""
 
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the command began."""
+        ...
+
     def message(self, text: str) -> None:
         """Prints a line that stays."""
 
@@ -108,7 +113,8 @@ def train_run(
             if seeds is not None:
                 run.write_summary(summary)
             progress.stop()
-            progress.message(messages.verdict(summary, run, config))
+            told = summary | {"total_seconds": progress.elapsed_s}  # with what passed before worlds were prepared
+            progress.message(messages.verdict(told, run, config))
     return summary
 
 

@@ -1,4 +1,4 @@
-"""The examples of the pages on deployment and on files of events run."""
+"""The examples of the pages on the runner and on files of events run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_the_runner_of_the_page_decides(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     export_policy(load_policy("pretrained"), tmp_path / "policy.onnx", checks=20)
-    exec(examples("deployment.md")[0], {})
+    exec(examples("runner.md")[0], {})
     assert re.match(r"\d+ \[", capsys.readouterr().out)
 
 

@@ -17,7 +17,7 @@ from edqn_jax.config import Config
 from tests.support.pages import PAGES, blocks_of, empty_module, name_of
 from tests.support.registries import keep_as_they_are
 
-ELSEWHERE = ("README.md", *(f"docs/{page}.md" for page in ("deployment", "functional", "gymnasium", "sweeps")))
+ELSEWHERE = ("README.md", *(f"docs/{page}.md" for page in ("runner", "functional", "gymnasium", "sweeps")))
 
 PYTHON = [page for page in PAGES if name_of(page) not in ELSEWHERE and blocks_of(page, "python")]
 
