@@ -176,6 +176,7 @@ def _add_cost(table: Table, cost: Cost) -> None:
     """Adds what a world takes."""
     by = "C, on GPUs CUDA" if not cost.drawn_by_jax else f"JAX, because of its {_words(*cost.drawn_by_jax)}"
     _add_row(table, "pictures are drawn by", f"{by}; about {_rounded(cost.picture_us)} µs each on two CPU cores")
+    _add_row(table, "training", f"some {_rounded(cost.decisions_per_s)} decisions/s on two CPU cores")
     _add_row(
         table,
         "memory",

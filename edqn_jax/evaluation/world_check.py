@@ -40,6 +40,9 @@ _PICTURE_US = {"c": 4.0, "jax": 45.0}
 _SHAPE_US = {"c": 0.1, "jax": 20.0, "fields": 1200.0}
 """What each shape adds: drawn in C; by JAX; a field, by JAX along rays that C follows, on a core."""
 
+_REST_US = 30.0
+"""Of a decision of training on two cores but for its pictures, as measured."""
+
 _SHAPE_BYTES = {"jax": 4.4, "fields": 9.6}
 """Bytes of a pixel that JAX holds for each shape while it draws a batch, as measured."""
 
@@ -55,6 +58,8 @@ class Cost:
     """Kinds of shape because of which pictures are drawn by JAX alone; empty if C or CUDA draws them."""
     picture_us: float
     """Microseconds of a picture on two CPU cores."""
+    decisions_per_s: float
+    """Of training on two CPU cores."""
     world_bytes: int
     training_bytes: int
     """Of the world and its pictures in a training of `num_envs` environments."""
@@ -250,9 +255,11 @@ def estimate_cost(config: Config, scene: Scene) -> Cost:
     grids = sum(grid.values.nbytes for shapes in scene.shapes().values() for grid in getattr(shapes, "grids", ()))
     envs = Config().train.num_envs
     pictures = len(config.events.frame_times_s) * pixels * held
+    picture_us = (_PICTURE_US["jax" if by_jax else "c"] + each) * pixels / (32 * 24)
     return Cost(
         drawn_by_jax=by_jax,
-        picture_us=(_PICTURE_US["jax" if by_jax else "c"] + each) * pixels / (32 * 24),
+        picture_us=picture_us,
+        decisions_per_s=1e6 / (len(config.events.frame_times_s) * picture_us + _REST_US),
         world_bytes=world + grids,
         training_bytes=int(_COPIES * grids + envs * (world + pictures)),
         num_envs=envs,

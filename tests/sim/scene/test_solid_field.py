@@ -26,17 +26,20 @@ def boxes(*bounds: list[list[float]]) -> trimesh.Trimesh:
     )
 
 
-def corner(thick: float) -> trimesh.Trimesh:
+def corner(thick: float) -> list[list[list[float]]]:
     """Three walls that meet in a corner."""
-    return boxes([[0, 0, 0], [thick, 2, 2]], [[0, 0, 0], [2, thick, 2]], [[0, 0, 0], [2, 2, thick]])
+    return [[[0, 0, 0], [thick, 2, 2]], [[0, 0, 0], [2, thick, 2]], [[0, 0, 0], [2, 2, thick]]]
 
 
-MESHES = {
-    "steps": boxes([[0, 0, 0], [2, 0.6, 1]], [[0, 0, 0], [0.6, 2, 1]]),
-    "ring": trimesh.creation.torus(1, 0.3),
-    "walls": corner(0.2),
-    "sheets": corner(0.01),
+WALL, SHEET = 0.2, 0.01
+BOXES = {
+    "steps": [[[0, 0, 0], [2, 0.6, 1]], [[0, 0, 0], [0.6, 2, 1]]],
+    "walls": corner(WALL),
+    "sheets": corner(SHEET),
 }
+"""By name: lowest and highest corners."""
+
+MESHES = {"ring": trimesh.creation.torus(1, 0.3)} | {name: boxes(*bounds) for name, bounds in BOXES.items()}
 
 
 def interpolated(grid: Grid, points: np.ndarray) -> np.ndarray:
@@ -79,6 +82,21 @@ def test_between_its_values_a_grid_is_hardly_ever_half_a_cell_too_small_and_neve
     assert error[np.abs(exact) < 0.2].max() < 0.01 and error[exact > -1e-9].max() < 0.01
     outside = error[exact > -1e-9]
     assert outside.min() > -0.1 and np.mean(outside < -0.05) < 0.03
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_of_1e5_points_outside_boxes_hardly_any_distance_is_half_a_cell_off(name: str) -> None:
+    mesh, bounds = boxes(*BOXES[name]), np.array(BOXES[name])
+    grid, middle = grid_of_mesh(mesh.vertices @ TURN.T, mesh.faces, CELL_M)
+    points = np.random.default_rng(7).uniform(-1, 1, (100_000, 3)) * (grid.half + 0.4)
+    there = ((points + middle) @ TURN)[:, None]
+    # Outside of several boxes the nearest is that of the union.
+    beyond = np.maximum(np.maximum(bounds[:, 0] - there, there - bounds[:, 1]), 0.0)
+    exact = np.linalg.norm(beyond, axis=-1).min(1)
+    error = (interpolated(grid, points) - exact)[exact > 0]
+    assert error[exact[exact > 0] < 0.2].max() < 0.01 and error.max() < 0.012
+    # Further off beside inner corners alone, where the distances of two walls meet.
+    assert error.min() > -0.1 and np.mean(error < -0.05) < 0.001
 
 
 def test_a_sheet_between_two_points_of_the_grid_does_not_vanish() -> None:

@@ -17,6 +17,7 @@ from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene
 from edqn_jax.sim.worlds import geodesic
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from tests.oracles import geodesic_plain
+from tests.support.meshes import CUBE, hull, mesh_world
 from tests.support.small_worlds import RADIUS, WITHOUT_A_WAY, box, random_small_world, small_world
 
 left = jax.jit(geodesic.distance_to_goal)
@@ -79,6 +80,17 @@ def test_through_a_thin_wall_it_is_the_way_around():
     field = one(scene)
     before, behind = (left(field, jnp.int32(0), scene.goal, jnp.array([x, 2.0, 3.0])) for x in (5.4, 6.6))
     assert before - behind > 10.0
+
+
+def test_through_a_thin_wall_of_a_mesh_it_is_the_way_around(tmp_path):
+    # As above: of two boxes side by side, so that the mesh is not convex.
+    parts = [hull(CUBE * [0.1, 4.0, 4.0] + [10, 4, 3]), hull(CUBE * [0.3, 0.5, 4.0] + [10, 1, 3])]
+    mesh = np.concatenate([part[0] for part in parts]), np.concatenate([parts[0][1], parts[1][1] + 8])
+    scene = load_scene(mesh_world(tmp_path, '<geom type="mesh" mesh="wall"/>', wall=mesh))
+    assert scene.others["fields"].position.shape[-2] == 1
+    field = one(scene)
+    before, behind = (left(field, jnp.int32(0), scene.goal, jnp.array([x, 2.5, 3.0])) for x in (8.8, 11.2))
+    assert before - behind > 8.0  # through it 2.4
 
 
 def test_ways_do_not_jump_along_a_straight_flight():
