@@ -279,8 +279,24 @@ def _warnings(config: Config, start: Policy | None) -> tuple[str, ...]:
     from edqn_jax.policies.unseen import describe_unseen
 
     if start is None:
-        return warn_of_training(config)
-    return (*warn_of_training(config, start.config), *describe_unseen(start.config, config))
+        return (*_idle_cores(config), *warn_of_training(config))
+    unseen = describe_unseen(start.config, config)
+    return (*_idle_cores(config), *warn_of_training(config, start.config), *unseen)
+
+
+def _idle_cores(config: Config) -> tuple[str, ...]:
+    """Returns what to do about CPU cores that the run leaves idle, where nobody said how many it is to use."""
+    import jax
+
+    from edqn_jax.devices.devices import describe_idle_cores
+    from edqn_jax.devices.hardware import count_cores
+
+    train = config.train
+    if train.debug or train.devices or jax.default_backend() != "cpu" or jax.process_count() > 1:
+        return ()
+    batches = train.num_envs // config.env.drones, config.agent.batch_size, config.encoder.batch_size
+    said = describe_idle_cores(train.shards, batches, count_cores())
+    return (said,) if said else ()
 
 
 def _check_sinks(options: TrainOptions) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
+from collections.abc import Sequence
 
 import jax
 
@@ -114,3 +116,20 @@ def choose_devices(requested: int, shards: int) -> list[jax.Device]:  # pyright:
 def most_that_divide(shards: int, available: int) -> int:
     """Returns the largest divisor of `shards` that is at most `available`."""
     return max(count for count in range(1, available + 1) if shards % count == 0)
+
+
+def describe_idle_cores(shards: int, batches: Sequence[int], cores: int) -> str:
+    """Returns a sentence that says how more cores are used than a run with these shards uses; empty if none can be.
+
+    Args:
+        shards: logical shards of environments and replay.
+        batches: what shards must divide, such as the number of environments.
+        cores: how many there are.
+    """
+    used, most = most_that_divide(shards, cores), most_that_divide(math.gcd(*batches), cores)
+    if most <= used:
+        return ""
+    return (
+        f"Training uses {used} of {cores} cores; with --train.shards {most} it uses {most}, and its random numbers are "
+        "others"
+    )

@@ -14,7 +14,7 @@ import jax
 import pytest
 
 from edqn_jax.devices import devices
-from edqn_jax.devices.devices import choose_devices, most_that_divide, use_cpu_devices
+from edqn_jax.devices.devices import choose_devices, describe_idle_cores, most_that_divide, use_cpu_devices
 from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
 
@@ -22,6 +22,21 @@ from edqn_jax.errors import ConfigError
 @pytest.mark.parametrize(("shards", "available", "used"), [(8, 2, 2), (8, 3, 2), (8, 7, 4), (8, 64, 8), (6, 4, 3)])
 def test_as_many_devices_as_divide_the_shards(shards, available, used):
     assert most_that_divide(shards, available) == used
+
+
+@pytest.mark.parametrize(
+    ("cores", "says"),
+    [
+        (8, ""),
+        (12, ""),  # neither 12 nor 9 to 11 divide what is batched
+        (16, "8 of 16 cores; with --train.shards 16 it uses 16"),
+        (24, "8 of 24 cores; with --train.shards 16 it uses 16"),
+        (2, ""),
+    ],
+)
+def test_idle_cores_are_told_where_more_shards_would_use_them(cores: int, says: str) -> None:
+    said = describe_idle_cores(8, (256, 256, 512), cores)
+    assert says in said and bool(said) is bool(says)
 
 
 def test_no_request_takes_what_divides_and_a_request_takes_just_that():

@@ -95,7 +95,10 @@ def bad_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
         ("inside out", "is inside out"),
         ("nan", "has a vertex that is not finite"),
         ("flat", "is flat"),
-        ("huge", r"measures 200 x 200 x 200 m, .* on a grid of 0.4 m would be .* values; a mesh may have 4,194,304.*millimetres"),
+        (
+            "huge",
+            r"measures 200 x 200 x 200 m, .* on a grid of 0.4 m would be .* values; a mesh may have 4,194,304.*millimetres",
+        ),
     ],
 )
 def test_a_mesh_that_cannot_be_a_field_is_refused_in_one_sentence(name: str, says: str) -> None:
