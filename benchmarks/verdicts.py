@@ -1,8 +1,8 @@
 """Are the outcomes right? Replays a run's flights in C MuJoCo, which shares no code with our distances.
 
 Meshes that are not convex, and height fields, are judged by trimesh's distances: MuJoCo takes a mesh for its hull.
-Prints for each outcome how many flights the judge confirms: a contact at the stated time for a collision, and no contact
-for any other outcome. The exit code is 1 if one outcome differs.
+Prints for each outcome how many flights the judge confirms: a contact at the stated time for a collision, and no
+contact for any other outcome. The exit code is 1 if one outcome differs.
 
     python benchmarks/verdicts.py RUN --missions 200
 """

@@ -97,7 +97,7 @@ def bad_mesh(name: str) -> tuple[np.ndarray, np.ndarray]:
         ("flat", "is flat"),
         (
             "huge",
-            r"measures 200 x 200 x 200 m, .* on a grid of 0.4 m would be .* values; a mesh may have 4,194,304.*millimetres",
+            r"measures 200 x 200 x 200 m, .* would be .* values; a mesh may have 4,194,304.*millimetres",
         ),
     ],
 )
