@@ -13,14 +13,22 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import os
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("MUJOCO_GL", "egl")
+from edqn_jax.errors import ConfigError
+from edqn_jax.interop.outer.opengl import load_mujoco
+
+try:
+    load_mujoco()
+except ConfigError as error:
+    if __name__ != "__main__":
+        raise
+    print(error, file=sys.stderr)
+    sys.exit(2)
 
 import jax
 import numpy as np
@@ -28,7 +36,6 @@ from numpy.typing import NDArray
 
 import edqn_jax
 from edqn_jax.config import Config
-from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.judge import clearance, load_judge, replay_contact
 from edqn_jax.evaluation.metrics import wilson_interval
 from edqn_jax.interop.deployment.onnx_export import export_policy

@@ -358,11 +358,12 @@ def replay(args: FlyArgs, folder: Path) -> None:
 
 def simulate(args: FlyArgs) -> None:
     """Flies missions here, over the wire."""
-    import os
     import tempfile
 
     if args.picture == "mujoco":
-        os.environ.setdefault("MUJOCO_GL", "egl")  # read as MuJoCo is imported
+        from edqn_jax.interop.outer.opengl import load_mujoco
+
+        load_mujoco()
 
     from edqn_jax.runs.policies import load_policy
     from edqn_jax.sim.environment import make

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -232,3 +235,20 @@ def test_a_flight_that_meets_goal_and_wall_in_one_decision_ends_with_what_came_f
     assert transfer._outcome(config, places, far, volume, None) == "goal"
     assert transfer._outcome(config, places, far, volume, Touch(1)) == "collision"
     assert transfer._outcome(config, places, far + [9, 0, 0], volume, None) is None
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [transfer.__file__, "--missions", "1"],
+        ["-m", "edqn_jax", "fly", "pretrained-looks", "--simulate", "rooms", "--picture", "mujoco"],
+    ],
+    ids=["transfer", "fly"],
+)
+def test_without_opengl_it_is_named_with_what_brings_it(words):
+    # MuJoCo looks for OpenGL as it is imported, so only a process of its own can tell.
+    environment = os.environ | {"MUJOCO_GL": "none-such", "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = subprocess.run([sys.executable, *words], env=environment, capture_output=True, text=True, timeout=120)
+    said = [line for line in ended.stderr.splitlines() if not line.startswith("edqn fly: ")]
+    assert ended.returncode == 2 and len(said) == 1
+    assert "MUJOCO_GL='none-such'" in said[0] and "install EGL (Debian: libegl1)" in said[0]

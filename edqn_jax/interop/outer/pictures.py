@@ -7,7 +7,6 @@ writes. Brightness is the luma of its 8-bit picture, 1 for white.
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable
 
 import mujoco
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, Config
-from edqn_jax.errors import ConfigError
+from edqn_jax.interop.outer.opengl import no_opengl
 from edqn_jax.sim.camera.painting.materials import painted_spec
 from edqn_jax.sim.environment import Environment
 
@@ -112,10 +111,7 @@ def mujoco_pictures(spec: mujoco.MjSpec, camera: CameraConfig) -> MujocoPictures
     try:
         renderer = mujoco.Renderer(model, camera.height * finer, camera.width * finer)
     except Exception as error:
-        raise ConfigError(
-            f"MuJoCo cannot draw with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} ({' '.join(str(error).split())}); "
-            "install EGL (Debian: libegl1) or OSMesa (libosmesa6) and name it in MUJOCO_GL: egl or osmesa"
-        ) from None
+        raise no_opengl(error) from None
     number = model.camera("outer").id
 
     def see(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
