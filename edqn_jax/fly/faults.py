@@ -195,9 +195,12 @@ def _seeing(before: Watch, inputs: Inputs, now: float, limits: Limits) -> Watch:
     sees, darkens = inputs.rate_hz >= limits.covered_hz * pixels, inputs.darkening >= limits.darkening
     # What is seen soon after it went dark may be the end of its going dark.
     opens = sees and (before.dark_at is None or now - before.dark_at > limits.covered_s)
+    # A slow drone may see nothing, but not one whose picture went dark: a burst made it hover, and would let it go on.
+    is_dark = before.dark_at is not None and not before.is_open
+    keeps = before.seen_at is not None and not sees and (moves or is_dark)
     return dataclasses.replace(
         before,
-        seen_at=before.seen_at if before.seen_at is not None and moves and not sees else now,
+        seen_at=before.seen_at if keeps else now,
         dark_at=now if darkens else before.dark_at,
         is_open=not darkens and (before.is_open or opens),
     )

@@ -206,6 +206,9 @@ def _hovering(state: State, inputs: Inputs, now: float, settings: Settings) -> t
         return _answer(state, worse, inputs, now, settings)
     if _waited(state, now) > settings.hover_s:
         return _finish(state, inputs, now, settings, settings.after_hover)
+    lasting = next((fault for fault in found if fault not in PASSING), None)
+    if lasting is not None and state.fault in PASSING and not state.outcome:
+        state = dataclasses.replace(state, fault=lasting)
     passes = state.fault in PASSING and state.resumes < settings.resumes and not state.outcome
     if not passes or found:
         return dataclasses.replace(state, clear_at=None), Output(STILL)

@@ -131,6 +131,15 @@ def test_a_shade_that_is_flown_into_is_no_cover() -> None:
     assert fly(settings(), shade, 5.0).state.outcome == "goal"
 
 
+def test_a_cover_whose_burst_makes_it_hover_does_not_let_it_go_on() -> None:
+    def bursts(inputs: Inputs, since: float) -> Inputs:
+        return dataclasses.replace(covered(inputs, since), rate_hz=2e7 if since < 0.15 else 0.0)
+
+    flown = fly(settings(), bursts, 5.0)
+    assert flown.state.outcome == Fault.COVERED and flown.state.resumes == 0
+    assert not flown.moves_after(5.0 + 2 * TICK_S)
+
+
 def test_a_cover_that_closes_slowly_is_one() -> None:
     def closes(inputs: Inputs, since: float) -> Inputs:
         darkening = 8.0 if since < 0.6 else 8.0 * max(0.0, 0.8 - since) / 0.2
