@@ -1,4 +1,4 @@
-"""The loop between camera, policy and vehicle on one page, to be copied where a camera or a rule of one's own is needed.
+"""The loop between camera, policy and vehicle on one page, to be copied where another camera or rule is needed.
 
     python examples/fly_loop.py policy.onnx tcp:127.0.0.1:7777 udpin:0.0.0.0:14540 40 0 3
 
@@ -26,7 +26,7 @@ from edqn_jax.interop.deployment.runner import Runner
 TICK_S = 0.02
 CAMERA, FOV_DEG, CONTRAST = (346, 260), 70.0, 0.2
 VOLUME = ((-5.0, -20.0, 0.0), (60.0, 20.0, 10.0))
-"""Lowest and highest corner of where it may fly, metres east, north and up of where the vehicle began; its fence, too."""
+"""Lowest and highest corner of where it may fly, metres east, north and up of where it began; its fence, too."""
 
 
 def fly(

@@ -50,6 +50,8 @@ class FlyArgs:
     """With --simulate: of the test worlds."""
     speed: Annotated[float, arg(metavar="X")] = 1.0
     """With --simulate: most simulated seconds a second. Where the machine is slower, the clock waits for it."""
+    cover_s: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """With --simulate: something covers the lens after so many simulated seconds."""
     picture: Literal["own", "mujoco"] = "own"
     """With --simulate: who draws what the camera sees."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -124,6 +126,8 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
         raise ConfigError("--simulate flies and --replay plays a flight again; give one of them")
     if min(args.missions, args.jobs) < 1 or args.seed < 0 or args.speed <= 0:
         raise ConfigError("--missions and --jobs must be at least 1, --seed at least 0 and --speed more than 0")
+    if args.cover_s is not None and (args.cover_s < 0 or args.simulate is None):
+        raise ConfigError("--cover-s must be at least 0 and goes with --simulate")
     if args.camera is not None and min(args.camera) < 1:
         raise ConfigError(f"--camera must be two whole numbers of at least 1, not {args.camera[0]} {args.camera[1]}")
     if args.mcap is not None and args.replay is None:
@@ -393,7 +397,8 @@ def simulate(args: FlyArgs) -> None:
         answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal]
         limits = ["--least-rate", repr(args.least_rate), "--unseen-s", repr(args.unseen_s)]
         more = (*answers, *limits, *(("--on", *args.on) if args.on else ()))
-        setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace, autopilot=more)
+        how = {"speed": args.speed, "picture": args.picture, "pace": args.pace, "cover_s": args.cover_s}
+        setup = Setup(file, size, **how, out=args.out, autopilot=more)
         flown = fly_missions(environment, setup) if args.jobs == 1 else fly_at_once(*asked, setup, jobs=args.jobs)
         show_phase("flying", 0, args.missions)
         for mission in flown:

@@ -25,6 +25,7 @@ from edqn_jax.cli import fly as command  # noqa: E402
 from edqn_jax.cli import main  # noqa: E402
 from edqn_jax.cli.process.signals import Stops  # noqa: E402
 from edqn_jax.errors import ConfigError  # noqa: E402
+from edqn_jax.fly.faults import Fault  # noqa: E402
 from edqn_jax.fly.link import Link  # noqa: E402
 from edqn_jax.fly.pilot import Pilot  # noqa: E402
 from edqn_jax.fly.records import FlightLog, read_records  # noqa: E402
@@ -79,6 +80,20 @@ def test_a_mission_is_flown_over_the_wire_and_its_log_goes_the_same_way_once_mor
     assert read_records(folder)[-1]["kind"] == "end"
     assert main(["fly", str(exported), "--replay", str(folder)]) == 0
     assert " 0 of them with another output" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_lens_that_is_covered_in_flight_ends_it_in_a_hover_that_touches_nothing(
+    exported: Path, tmp_path: Path
+) -> None:
+    world = tmp_path / "easy.xml"
+    world.write_text(EASY.replace('pos="14 10 3"', 'pos="26 10 3"'))
+    environment = environment_of(str(world), load_policy("pretrained-looks").config, 1, 0)
+    flown = fly_mission(environment, 0, Setup(exported, out=tmp_path, cover_s=3.0))
+    assert flown.outcome == Fault.COVERED and flown.clearance_m > 0.0
+    ticks = [each for each in read_records(tmp_path / "mission-0") if each["kind"] == "tick"]
+    late = [each["output"]["velocity"] for each in ticks if each["now"] > 3.5]
+    assert late and not any(velocity is not None and any(velocity) for velocity in late)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import subprocess
 import sys
@@ -35,6 +36,9 @@ from edqn_jax.sim.environment import Environment, make
 MARGIN_M = 0.25
 """The autopilot's goal is so much smaller than the mission's: it knows its place no better."""
 
+COVERING_S = 0.02
+"""A lens that is covered has a third of its light after so long."""
+
 EXTRA_S = 15.0
 """Beside the longest flight: to begin and to end."""
 
@@ -59,6 +63,8 @@ class Setup:
     """As in `Pilot`."""
     autopilot: tuple[str, ...] = ()
     """More options of `edqn fly`."""
+    cover_s: float | None = None
+    """Simulated seconds after which something covers the lens, within a tenth of a second; None never does."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,7 +144,7 @@ def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         out = folder if setup.out is None else setup.out / f"mission-{number}"
-        see = _see(environment, number, setup, stack)
+        see = _covered(_see(environment, number, setup, stack), setup)
         camera = EventCamera(see, lambda attitude: camera_rotation(attitude, config.camera.mount))
         server = EventServer(setup.size)
         stack.callback(server.close)
@@ -220,6 +226,19 @@ def _see(environment: Environment, number: int, setup: Setup, stack: contextlib.
     drawn = pictures.mujoco_pictures(pictures.spec_of(environment, number, "own", number), lens)
     stack.callback(drawn.close)
     return drawn.see
+
+
+def _covered(see: pictures.See, setup: Setup) -> pictures.See:
+    """Returns pictures of which the light is gone after a while; one is drawn each `frame_s`."""
+    if setup.cover_s is None:
+        return see
+    numbers, since = itertools.count(1), setup.cover_s
+
+    def look(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+        late = max(0.0, next(numbers) * setup.frame_s - since)
+        return see(position, rotation) * np.exp(-late / COVERING_S)
+
+    return look
 
 
 def _vehicle_words(start: NDArray, yaw: float, port: int, clock: str, seed: int) -> list[str]:
