@@ -13,9 +13,10 @@ from tests.support.virtual_pilot import FENCE, SETTINGS, Camera, Policy, Time, W
 
 
 def flown(camera: Camera | None = None, **more: Any) -> tuple[str, Wire, Policy]:
-    wire, policy = Wire(), Policy()
-    parts: Any = (policy, wire, camera or Camera(), Time())
-    return fly_loop.fly(*parts, SETTINGS, FENCE, **more), wire, policy
+    wire, policy, source, clock = Wire(), Policy(), camera or Camera(), Time()
+    flier: Any = policy
+    vehicle: Any = wire
+    return fly_loop.fly(flier, vehicle, source, clock, SETTINGS, FENCE, **more), wire, policy
 
 
 def test_the_loop_of_one_page_sends_what_the_packages_sends() -> None:
