@@ -40,35 +40,44 @@ def fly(
 ) -> str:
     """Flies one mission and returns how it ended: `goal`, `refused: ...`, or a fault."""
     state, command, due, tick = State(), None, 0.0, clock.now()
-    while state.phase is not Phase.ENDED:
-        now = clock.now()
-        source.read(now)
-        link.read(now)
-        events = source.events
-        inputs = dataclasses.replace(
-            link.inputs(),
-            packet_at=events.packet_at,
-            rate_hz=events.rate_hz(now),
-            darkening=events.darkening(now),
-            camera=events.size,
-            stop=stop(),
-            command=command,
-        )
-        before = state.phase
-        state, output = step(state, inputs, now, settings)
-        if state.phase is Phase.FLYING and before is not Phase.FLYING:
-            runner.reset()  # the policy has seen nothing yet
-            link.forget_masters()
-            due, command = now, None
-        if output.decides and now >= due:
-            due = max(due + settings.period_s, now)
-            command = decide(runner, link, source, now, settings, volume) or command
-            state, output = step(state, dataclasses.replace(inputs, command=command), clock.now(), settings)
-        link.send(output.velocity, output.yaw, now)  # 50 times a second, the last command or zero
-        if output.request is not None:
-            link.request(output.request)
-        tick += TICK_S
-        clock.sleep_until(tick)
+    try:
+        while state.phase is not Phase.ENDED:
+            now = clock.now()
+            source.read(now)
+            link.read(now)
+            events = source.events
+            inputs = dataclasses.replace(
+                link.inputs(),
+                packet_at=events.packet_at,
+                rate_hz=events.rate_hz(now),
+                darkening=events.darkening(now),
+                camera=events.size,
+                stop=stop(),
+                command=command,
+            )
+            before = state.phase
+            state, output = step(state, inputs, now, settings)
+            if state.phase in (Phase.READY, Phase.FLYING) and before is not state.phase:
+                link.forget_masters()  # who steered before is none of the flight
+            if state.phase is Phase.FLYING and before is not Phase.FLYING:
+                runner.reset()  # the policy has seen nothing yet
+                due, command = now, None
+            if output.decides and now >= due:
+                due = max(due + settings.period_s, now)
+                command = decide(runner, link, source, now, settings, volume) or command
+                state, output = step(state, dataclasses.replace(inputs, command=command), clock.now(), settings)
+            link.send(output.velocity, output.yaw, now)  # 50 times a second, the last command or zero
+            if output.request is not None:
+                link.request(output.request)
+            for said in link.said:
+                print(said)
+            link.said.clear()
+            tick = max(tick + TICK_S, clock.now())
+            clock.sleep_until(tick)
+    except BaseException:
+        if state.phase in (Phase.FLYING, Phase.HOVERING):
+            link.request("hold")
+        raise
     return state.outcome
 
 
@@ -98,7 +107,8 @@ def decide(
 if __name__ == "__main__":
     policy, camera, vehicle, *goal = sys.argv[1:]
     asked: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _: asked.append(number))
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: asked.append(number))
     pilot = Runner(policy, camera=CAMERA, camera_fov_deg=FOV_DEG, contrast=CONTRAST)
     task = Settings(np.array(goal, float), np.array(VOLUME), CAMERA, pilot.period_s)
     print(fly(pilot, Link(vehicle), open_events(camera, CAMERA), WallClock(), task, VOLUME, lambda: bool(asked)))

@@ -29,6 +29,9 @@ Ending = Literal["hover", "hold", "land"]
 OF_THE_WORLD = "mavlink events fov calibration contrast goal volume fence origin goal_radius max_s dry clock".split()
 """Options that a simulated flight has from its world."""
 
+DARKENING = 0.4
+"""Natural logarithm of how much darker the whole picture is from which on it has gone dark."""
+
 OF_THE_LOG = ("fov", "contrast")
 """Options that a flight's log holds, where they are not given once more."""
 
@@ -324,10 +327,20 @@ def settings_of(args: FlyArgs, size: tuple[int, int], period_s: float) -> Settin
             after_hover=Action(args.after_hover),
             at_goal=Action(args.at_goal),
             flight_s=args.max_s,
-            limits=Limits(covered_hz=args.least_rate, unseen_s=args.unseen_s / args.pace),
+            limits=Limits(
+                covered_hz=args.least_rate, unseen_s=args.unseen_s / args.pace, **darkening_of(args.contrast)
+            ),
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
+
+
+def darkening_of(contrast: float | None) -> dict[str, float]:
+    """Returns by how many OFF events a pixel a camera of this contrast sees its picture go dark; {} if it is not told.
+
+    As much less light makes more events of a smaller contrast.
+    """
+    return {} if contrast is None else {"darkening": DARKENING / contrast}
 
 
 def replay(args: FlyArgs, folder: Path) -> None:

@@ -40,8 +40,8 @@ _PICTURE_US = {"c": 4.0, "jax": 45.0}
 _SHAPE_US = {"c": 0.1, "jax": 20.0, "fields": 1200.0}
 """What each shape adds: drawn in C; by JAX; a field, by JAX along rays that C follows, on a core."""
 
-_REST_US = 30.0
-"""Of a decision of training on two cores but for its pictures, as measured."""
+_REST_US = 21.0
+"""Of a decision of training on two cores but for its two pictures: some 34,000 a second (docs/performance.md)."""
 
 _SHAPE_BYTES = {"jax": 4.4, "fields": 9.6}
 """Bytes of a pixel that JAX holds for each shape while it draws a batch, as measured."""

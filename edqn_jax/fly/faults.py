@@ -120,9 +120,12 @@ class Limits:
     """Events per second and pixel of the camera that a drone in motion sees at least through an open lens."""
     darkening: float = 2.0
     """OFF events less ON ones, a pixel and 200 ms, from which on the whole picture has gone dark: at a contrast of 0.2
-    to two thirds of its brightness. Flights through open worlds come to 0.8, a covered lens to 10 and more."""
+    to two thirds of its brightness. Flights through open worlds come to 0.8, a lens that is covered at once to 10 and
+    more."""
     covered_s: float = 0.4
     """So long a lens that went dark, or has seen nothing yet, sees too little before it is called covered."""
+    lit_s: float = 1.0
+    """So long one that went dark must see enough again to count as open: the end of its going dark is no light."""
     unseen_s: float = 8.0
     """So long one that did not: blank walls, the ground and the sky show a good lens nothing for 6 s."""
     moving_m_s: float = 1.0
@@ -154,8 +157,15 @@ class Watch:
     """When the camera last saw enough, or the drone was too slow to see anything."""
     dark_at: float | None = None
     """When the whole picture last went dark."""
+    lit_at: float | None = None
+    """Since when it has seen enough at every step; None if it does not."""
     is_open: bool = False
     """Whether the camera has seen enough since it last went dark, so that to see nothing is no sign of a cover."""
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether the whole picture went dark and has not been light again."""
+        return self.dark_at is not None and not self.is_open
 
 
 def watch(before: Watch, inputs: Inputs, now: float, limits: Limits) -> Watch:
@@ -193,15 +203,15 @@ def _seeing(before: Watch, inputs: Inputs, now: float, limits: Limits) -> Watch:
     pixels = 1 if inputs.camera is None else inputs.camera[0] * inputs.camera[1]
     moves = inputs.odometry is not None and float(np.linalg.norm(inputs.odometry.velocity)) > limits.moving_m_s
     sees, darkens = inputs.rate_hz >= limits.covered_hz * pixels, inputs.darkening >= limits.darkening
-    # What is seen soon after it went dark may be the end of its going dark.
-    opens = sees and (before.dark_at is None or now - before.dark_at > limits.covered_s)
+    lit_at = (now if before.lit_at is None else before.lit_at) if sees and not darkens else None
+    opens = lit_at is not None and (before.dark_at is None or now - lit_at >= limits.lit_s)
     # A slow drone may see nothing, but not one whose picture went dark: a burst made it hover, and would let it go on.
-    is_dark = before.dark_at is not None and not before.is_open
-    keeps = before.seen_at is not None and not sees and (moves or is_dark)
+    keeps = before.seen_at is not None and not sees and (moves or before.is_dark)
     return dataclasses.replace(
         before,
         seen_at=before.seen_at if keeps else now,
         dark_at=now if darkens else before.dark_at,
+        lit_at=lit_at,
         is_open=not darkens and (before.is_open or opens),
     )
 

@@ -98,7 +98,9 @@ def settings_of(record: dict[str, Any]) -> Settings:
     fields["camera"] = tuple(fields["camera"])
     fields["actions"] = {Fault(fault): Action(action) for fault, action in fields["actions"].items()}
     fields["after_hover"], fields["at_goal"] = Action(fields["after_hover"]), Action(fields["at_goal"])
-    fields["limits"] = Limits(**fields["limits"])
+    limits = fields["limits"]
+    # Where a log is older than `unseen_s`, every lens that saw too little for `covered_s` was covered.
+    fields["limits"] = Limits(**{"unseen_s": limits["covered_s"]} | limits)
     return Settings(**fields)
 
 

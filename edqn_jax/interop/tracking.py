@@ -191,7 +191,7 @@ class Rerun:
         self._stream.log("world/ends", self._rerun.Points3D([path[-1] for path in paths], colors=colours, radii=0.4))
 
     def _mesh(self, scene: Any) -> Any:
-        """Returns the solids of a world as one mesh; of a mesh that is not convex its own triangles."""
+        """Returns the solids of a world as one mesh; of a mesh that is not convex up to 50,000 triangles."""
         corners, triangles, colours, count = [], [], [], 0
         for points, rings, colour in surfaces_of(scene):
             corners.append(points)

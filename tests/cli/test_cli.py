@@ -18,7 +18,7 @@ import pytest
 from edqn_jax.cli import commands, main, train
 from edqn_jax.cli.arguments import MEANINGS, flags_of
 from edqn_jax.cli.evaluate import EvaluateArgs, parse_evaluate
-from edqn_jax.cli.fly import parse_fly, simulate
+from edqn_jax.cli.fly import darkening_of, parse_fly, simulate
 from edqn_jax.cli.help import COMMON, NAMED, flag_of
 from edqn_jax.cli.train import parse_train, train_flags
 from edqn_jax.config import Config, get_preset
@@ -27,6 +27,7 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.config.presets import RANDOM_WORLDS
 from edqn_jax.devices import devices
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
+from edqn_jax.fly.faults import Limits
 from edqn_jax.native.shipped import describe_library
 from edqn_jax.sim.scene.mjcf import SceneError
 from tests.support.processes import PATIENCE_S
@@ -346,6 +347,11 @@ def test_a_simulated_flights_world_is_looked_at_before_its_packages(monkeypatch)
         simulate(args)
     with pytest.raises(ImportError):
         simulate(dataclasses.replace(args, simulate="rooms"))
+
+
+def test_a_camera_of_a_smaller_contrast_sees_more_events_as_its_lens_is_covered():
+    assert darkening_of(0.2) == {"darkening": Limits.darkening} and darkening_of(0.1) == {"darkening": 4.0}
+    assert darkening_of(None) == {}
 
 
 def test_help_all_lists_every_option_and_does_not_start_jax():

@@ -118,6 +118,7 @@ def test_a_mesh_becomes_a_field_that_only_jax_draws(tmp_path: Path) -> None:
     assert [warning for warning in found.warnings if "alone do not draw the fields" in warning] == list(found.warnings)
     plain = check_world(ROOMS, str(corridor(tmp_path, WIDE))).cost
     assert plain is not None and plain.drawn_by_jax == [] and found.cost.picture_us > 10 * plain.picture_us
+    assert 20_000 < plain.decisions_per_s < 35_000 and found.cost.decisions_per_s < plain.decisions_per_s / 2
     grid = load_scene(file).others["fields"].grids[0]
     assert found.cost.world_bytes > grid.values.nbytes and found.cost.training_bytes > 2 * grid.values.nbytes
 

@@ -55,6 +55,17 @@ def test_a_log_is_played_again_with_the_same_outputs_and_moves(tmp_path: Path) -
     assert replay(tmp_path / "flight", Policy()).other_moves == 1  # pyright: ignore[reportArgumentType]
 
 
+def test_a_log_from_before_lenses_were_told_apart_keeps_its_rule(tmp_path: Path) -> None:
+    log = FlightLog(tmp_path / "flight")
+    make(log=log)[0].fly()
+    log.close()
+    record = next(each for each in read_records(tmp_path / "flight") if each["kind"] == "settings")["settings"]
+    assert settings_of(record).limits == SETTINGS.limits
+    for new in ("unseen_s", "darkening", "lit_s"):
+        del record["limits"][new]
+    assert settings_of(record).limits.unseen_s == SETTINGS.limits.covered_s
+
+
 class Packets(Camera):
     """A camera that sends a packet now and then, until it ends."""
 
