@@ -129,7 +129,4 @@ def describe_idle_cores(shards: int, batches: Sequence[int], cores: int) -> str:
     used, most = most_that_divide(shards, cores), most_that_divide(math.gcd(*batches), cores)
     if most <= used:
         return ""
-    return (
-        f"Training uses {used} of {cores} cores; with --train.shards {most} it uses {most}, and its random numbers are "
-        "others"
-    )
+    return f"Training uses {used} of {cores} cores; with --train.shards {most} it uses {most}, and other random numbers"
