@@ -43,7 +43,10 @@ LABELS = {
     "no difference": "no difference",
 }
 
-SHORT = {"frames": "frame", "frame-pair": "pair", "frame-difference": "diff.", "depth-late-1": "late", BLIND: "blind"}
+SHORT = {
+    **{"frames": "frame", "frame-pair": "pair", "frame-difference": "diff.", BLIND: "blind"},
+    **{DEPTH: "fresh", "depth-late-1": "1 late", "depth-late-2": "2 late"},
+}
 
 CONTRASTS = (0.05, 0.2)
 """Of the sensors whose bytes are drawn; tables have others, and more resolutions than the smallest and the largest."""
