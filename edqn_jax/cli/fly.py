@@ -53,8 +53,10 @@ class FlyArgs:
     """With --simulate: of the test worlds."""
     speed: Annotated[float, arg(metavar="X")] = 1.0
     """With --simulate: most simulated seconds a second. Where the machine is slower, the clock waits for it."""
-    cover_s: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
-    """With --simulate: something covers the lens after so many simulated seconds."""
+    fault: Annotated[str | None, arg(metavar="FAULT", help_behavior_hint="")] = None
+    """With --simulate: what goes wrong in each flight, by its name in docs/deployment.md, or "process killed"."""
+    fault_s: Annotated[tuple[float, float], arg(metavar="S S")] = (3.0, 8.0)
+    """With --fault: between which simulated seconds, drawn for each mission."""
     picture: Literal["own", "mujoco"] = "own"
     """With --simulate: who draws what the camera sees."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -129,8 +131,7 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
         raise ConfigError("--simulate flies and --replay plays a flight again; give one of them")
     if min(args.missions, args.jobs) < 1 or args.seed < 0 or args.speed <= 0:
         raise ConfigError("--missions and --jobs must be at least 1, --seed at least 0 and --speed more than 0")
-    if args.cover_s is not None and (args.cover_s < 0 or args.simulate is None):
-        raise ConfigError("--cover-s must be at least 0 and goes with --simulate")
+    check_fault(args)
     if args.camera is not None and min(args.camera) < 1:
         raise ConfigError(f"--camera must be two whole numbers of at least 1, not {args.camera[0]} {args.camera[1]}")
     if args.mcap is not None and args.replay is None:
@@ -165,6 +166,20 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
             if getattr(args, name) is None:
                 raise ConfigError(f"--{name} is missing; '{FLY} --help' says what it is")
     return args
+
+
+def check_fault(args: FlyArgs) -> None:
+    """Raises ConfigError if there is no such fault to simulate, or it would strike at no time."""
+    from edqn_jax.fly.simulated.injected import FAULTS
+
+    if not 0.0 <= args.fault_s[0] <= args.fault_s[1]:
+        raise ConfigError("--fault-s must be two times of at least 0, the earlier one first")
+    if args.fault is None:
+        return
+    if args.simulate is None:
+        raise ConfigError("--fault goes with --simulate: nothing else goes wrong on purpose")
+    if args.fault not in FAULTS:
+        raise ConfigError(f"--fault '{args.fault}' cannot be simulated{suggest_nearest(args.fault, FAULTS)}")
 
 
 def actions_of(words: Sequence[str]) -> dict:
@@ -410,7 +425,8 @@ def simulate(args: FlyArgs) -> None:
         answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal]
         limits = ["--least-rate", repr(args.least_rate), "--unseen-s", repr(args.unseen_s)]
         more = (*answers, *limits, *(("--on", *args.on) if args.on else ()))
-        how = {"speed": args.speed, "picture": args.picture, "pace": args.pace, "cover_s": args.cover_s}
+        how = {"speed": args.speed, "picture": args.picture, "pace": args.pace}
+        how |= {"fault": args.fault, "fault_s": args.fault_s}
         setup = Setup(file, size, **how, out=args.out, autopilot=more)
         flown = fly_missions(environment, setup) if args.jobs == 1 else fly_at_once(*asked, setup, jobs=args.jobs)
         show_phase("flying", 0, args.missions)

@@ -89,8 +89,9 @@ def test_a_lens_that_is_covered_in_flight_ends_it_in_a_hover_that_touches_nothin
     world = tmp_path / "easy.xml"
     world.write_text(EASY.replace('pos="14 10 3"', 'pos="26 10 3"'))
     environment = environment_of(str(world), load_policy("pretrained-looks").config, 1, 0)
-    flown = fly_mission(environment, 0, Setup(exported, out=tmp_path, cover_s=3.0))
-    assert flown.outcome == Fault.COVERED and flown.clearance_m > 0.0
+    flown = fly_mission(environment, 0, Setup(exported, out=tmp_path, fault=Fault.COVERED, fault_s=(3.0, 3.0)))
+    assert flown.outcome == Fault.COVERED and flown.mode == "hold"
+    assert flown.fault_s == pytest.approx(3.0, abs=0.1) and (flown.clearance_after_m or 0.0) > 0.0
     ticks = [each for each in read_records(tmp_path / "mission-0") if each["kind"] == "tick"]
     late = [each["output"]["velocity"] for each in ticks if each["now"] > 3.5]
     assert late and not any(velocity is not None and any(velocity) for velocity in late)
@@ -140,7 +141,8 @@ def test_a_flight_that_is_cut_off_says_why(tmp_path: Path, keeper: Any, said: st
     nothing: Any = None
     flight = missions.Flight(nothing, np.zeros(3), 1.0)
     flight.least_clearance = lambda: 1.0
-    why = missions._conduct(keeper, nothing, nothing, flight, 0.01, 20.0)
+    stage = missions.Stage(nothing, nothing, 0.01, 20.0, nothing)
+    why = missions._conduct(keeper, flight, stage)
     if said is not None:
         log = FlightLog(tmp_path)
         log.write("end", outcome=said)
@@ -284,6 +286,10 @@ ROOM = ["--goal", "9", "0", "5", "--volume", "0", "-5", "0", "20", "5", "9"]
         (["a.onnx", *ROOM, "--fov", "70", "--calibration", "a.yaml"], "--fov and --calibration cannot both be given"),
         (["pretrained", "--simulate", "medium", "--calibration", "a"], "--simulate gives --calibration itself"),
         (["a.onnx", "--simulate", "medium", "--replay", "b"], "give one of them"),
+        (["pretrained", "--simulate", "medium", "--fault", "bad weather"], "'bad weather' cannot be simulated"),
+        (["pretrained", "--simulate", "medium", "--fault", "lost lnk"], "did you mean 'lost link'?"),
+        (["pretrained", "--simulate", "medium", "--fault-s", "5", "3"], "two times of at least 0, the earlier one"),
+        (["a.onnx", *ROOM, "--fault", "lost link"], "--fault goes with --simulate"),
     ],
 )
 def test_bad_input_is_one_sentence(

@@ -12,11 +12,13 @@ import pytest
 pytest.importorskip("pymavlink")
 pytest.importorskip("rotorpy")
 
-from edqn_jax.fly.faults import Settings  # noqa: E402
+from edqn_jax.fly.faults import Fault, Settings  # noqa: E402
 from edqn_jax.fly.link import Link  # noqa: E402
 from edqn_jax.fly.pilot import Pilot, Task  # noqa: E402
 from edqn_jax.fly.simulated import vehicle as simulated  # noqa: E402
+from edqn_jax.fly.simulated.injected import OF_VEHICLE  # noqa: E402
 from edqn_jax.fly.simulated.lockstep import SimulatedClock  # noqa: E402
+from edqn_jax.fly.simulated.manners import HOLD, LAND, POSITION  # noqa: E402
 from edqn_jax.fly.streams import EVENT, Events  # noqa: E402
 from edqn_jax.interop.deployment.runner import Command  # noqa: E402
 from edqn_jax.interop.outer.rotorpy_body import STEP_S  # noqa: E402
@@ -140,12 +142,12 @@ def test_a_ground_station_on_another_endpoint_is_forwarded(make: Callable[..., T
 
 
 class Steps:
-    """A clock that lets the vehicle fly while the pilot sleeps, and what happens to it at a time."""
+    """A clock that lets the vehicle fly while the pilot sleeps."""
 
     passes = False
 
-    def __init__(self, both: Together, at: float, happens: Callable[[Together], None]) -> None:
-        self.both, self._at, self._happens = both, both.now + at, happens
+    def __init__(self, both: Together) -> None:
+        self.both = both
 
     def now(self) -> float:
         return self.both.now
@@ -154,8 +156,6 @@ class Steps:
         while self.both.now < moment - STEP_S / 2:
             self.both.vehicle.step()
             self.both.now += STEP_S
-        if self.both.now >= self._at:
-            self._happens(self.both)
 
     def work(self) -> None: ...
 
@@ -190,54 +190,41 @@ class Ahead:
         return Command(22, np.array([3.0, 0.0, 0.0], np.float32), 0.0, np.zeros(27, np.float32))
 
 
-def fly_until(both: Together, happens: Callable[[Together], None], at: float = 3.5) -> str:
+def fly_ahead(both: Together) -> str:
     fence = np.array([[-10.0, -10.0, 0.0], [200.0, 20.0, 20.0]])
     settings = Settings(goal=np.array([100.0, 4.0, 5.0]), fence=fence, camera=(346, 260), period_s=0.26)
     policy: Any = Ahead()
     task = Task(settings, fence)
-    return Pilot(policy, both.link, Sees(), Steps(both, at, happens), task, tell=lambda _: None).fly().outcome
-
-
-def drain(both: Together) -> None:
-    both.vehicle._battery = 0.15
-
-
-def take_over(both: Together) -> None:
-    both.vehicle.manners.mode = (3, 0)
-
-
-def fall_silent(both: Together) -> None:
-    both.vehicle._tell_state = lambda body: None  # pyright: ignore[reportAttributeAccessIssue]
-
-
-def jump(both: Together) -> None:
-    both.vehicle._drift = np.array([0.0, 3.0, 0.0])
-
-
-def drift(both: Together) -> None:
-    both.vehicle._drift += [0.0, 0.025, 0.0]
+    return Pilot(policy, both.link, Sees(), Steps(both), task, tell=lambda _: None).fly().outcome
 
 
 @pytest.mark.parametrize(
-    ("happens", "outcome", "mode"),
+    ("fault", "outcome", "mode"),
     [
-        (drain, "low battery", (4, 6)),
-        (take_over, "taken over", (3, 0)),
-        (fall_silent, "stale odometry", (4, 3)),
-        (jump, "odometry jump", (4, 3)),
-        (drift, "odometry drift", (4, 3)),
+        (Fault.BATTERY, "low battery", LAND),
+        (Fault.TAKEN_OVER, "taken over", POSITION),
+        (Fault.STALE, "stale odometry", HOLD),
+        (Fault.JUMP, "odometry jump", HOLD),
+        (Fault.DRIFT, "odometry drift", HOLD),
+        (Fault.LOST_LINK, "lost link; the vehicle did not confirm hold", HOLD),
+        (Fault.SECOND_MASTER, "second master", HOLD),
     ],
 )
 def test_faults_over_the_wire_end_as_configured(
-    make: Callable[..., Together], happens: Callable[[Together], None], outcome: str, mode: tuple[int, int]
+    make: Callable[..., Together], fault: Fault, outcome: str, mode: tuple[int, int]
 ) -> None:
-    both = make("--ground", "4.8")
-    assert fly_until(both, happens) == outcome
+    both = make("--ground", "4.8", "--fault", str(fault), "--fault-s", "3.5")
+    assert fly_ahead(both) == outcome
     assert both.vehicle.manners.mode == mode
     place, velocity = both.truth()
     assert place[0] > START[0] + 2.0, "it flew"
-    if mode != (4, 6):
-        assert np.linalg.norm(velocity) < 0.5 or outcome == "taken over"
+    if mode == HOLD and fault is not Fault.SECOND_MASTER:  # which is left to the vehicle at once
+        assert np.linalg.norm(velocity) < 0.5
+
+
+def test_all_faults_of_a_vehicle_are_tried() -> None:
+    tried = next(mark for mark in test_faults_over_the_wire_end_as_configured.pytestmark if mark.name == "parametrize")
+    assert {row[0] for row in tried.args[1]} == set(OF_VEHICLE)
 
 
 def test_it_leaves_the_clock_as_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,10 +35,19 @@ class EventCamera:
         self.seen = 0
         """Events so far."""
 
-    def frame(self, time: float, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> tuple[int, NDArray]:
-        """Returns until when its events are known, its own clock's microseconds, and those [N] since the last frame."""
+    def frame(
+        self, time: float, position: NDArray[np.float64], quaternion: NDArray[np.float64], light: float = 1.0
+    ) -> tuple[int, NDArray]:
+        """Returns until when its events are known, its own clock's microseconds, and those [N] since the last frame.
+
+        Args:
+            time: simulated seconds.
+            position: [3] metres.
+            quaternion: [4] of the body.
+            light: share of it that comes through the lens.
+        """
         own_s = AHEAD_S + time * (1.0 + FAST)
-        columns, rows, signs = self._esim.events(self._see(position, self._rotation(quaternion)))
+        columns, rows, signs = self._esim.events(light * self._see(position, self._rotation(quaternion)))
         self.seen += len(signs)
         until = round(1e6 * own_s)
         events = np.empty(len(signs), EVENT)

@@ -6,15 +6,16 @@ the loopback. They share a simulated clock, so that a flight does not depend on 
 
 from __future__ import annotations
 
+import bisect
 import contextlib
 import dataclasses
-import itertools
+import functools
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,11 @@ from numpy.typing import NDArray
 
 from edqn_jax.config import Config
 from edqn_jax.evaluation.judge import MujocoWorld, clearance, load_judge, replay_contact
+from edqn_jax.fly.faults import Fault
+from edqn_jax.fly.link import MODES, PX4
 from edqn_jax.fly.records import RECORDS, read_records
 from edqn_jax.fly.simulated.camera import EventCamera, EventServer
+from edqn_jax.fly.simulated.injected import OF_VEHICLE, CameraFault, fence_of, moment_of, strike
 from edqn_jax.fly.simulated.lockstep import Keeper
 from edqn_jax.fly.simulated.ports import hold_udp_port
 from edqn_jax.fly.simulated.vehicle import TRUTH
@@ -36,11 +40,14 @@ from edqn_jax.sim.environment import Environment, make
 MARGIN_M = 0.25
 """The autopilot's goal is so much smaller than the mission's: it knows its place no better."""
 
-COVERING_S = 0.02
-"""A lens that is covered has a third of its light after so long."""
-
 EXTRA_S = 15.0
 """Beside the longest flight: to begin and to end."""
+
+AFTER_S = 4.0
+"""So long a vehicle to which something has happened is judged without its autopilot: until it stands."""
+
+DESCENT_M_S = 0.5
+"""A vehicle that lands, and moves slower across, descends on the spot, on whatever is there: that is no collision."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,8 +70,10 @@ class Setup:
     """As in `Pilot`."""
     autopilot: tuple[str, ...] = ()
     """More options of `edqn fly`."""
-    cover_s: float | None = None
-    """Simulated seconds after which something covers the lens, within a tenth of a second; None never does."""
+    fault: str | None = None
+    """What goes wrong in each flight, of `injected.FAULTS`; None nothing."""
+    fault_s: tuple[float, float] = (3.0, 8.0)
+    """Between which simulated seconds, drawn for each mission."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,6 +93,12 @@ class Mission:
     """Mean over the flight."""
     speed: float
     """Simulated seconds a second."""
+    fault_s: float | None = None
+    """When the fault of `Setup.fault` struck, simulated seconds; None if there is none, or the flight had ended."""
+    clearance_after_m: float | None = None
+    """Least distance since then."""
+    mode: str = ""
+    """The vehicle's last: `offboard`, `hold`, `land` or `other`."""
 
 
 @dataclasses.dataclass
@@ -97,13 +112,20 @@ class Flight:
     places: list[NDArray[np.float64]] = dataclasses.field(default_factory=list)
     reached: bool = False
     hit: bool = False
+    mode: tuple[int, int] = (0, 0)
+    """Of the vehicle, main and sub."""
+    fault_s: float | None = None
+    """When its fault struck."""
     _judged: int = 0
 
     def add(self, truth: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Takes where the vehicle is, and returns position [3] and attitude [4]."""
-        numbers = np.array(TRUTH.unpack(truth)[:11])
-        self.times.append(numbers[0])
-        self.places.append(numbers[1:4])
+        *told, main, sub, _, _ = TRUTH.unpack(truth)
+        numbers, self.mode = np.array(told), (main, sub)
+        lands = self.mode == MODES[PX4]["land"] and float(np.hypot(*numbers[8:10])) < DESCENT_M_S
+        if not lands or not self.places:
+            self.times.append(numbers[0])
+            self.places.append(numbers[1:4])
         self.reached = self.reached or bool(np.linalg.norm(numbers[1:4] - self.goal) <= self.radius_m)
         if len(self.places) - self._judged > 50:
             self.judge_now()
@@ -116,9 +138,28 @@ class Flight:
             self.hit = self.hit or replay_contact(self.judge, places) is not None
             self._judged = len(self.places) - 1
 
-    def least_clearance(self) -> float:
-        """Returns the least distance to a solid, at every fourth pose."""
-        return 0.0 if self.hit else min(clearance(self.judge, place)[0] for place in self.places[::4])
+    def least_clearance(self, since_s: float = 0.0) -> float:
+        """Returns the least distance to a solid, at every fourth pose from a time on."""
+        first = min(bisect.bisect_left(self.times, since_s), len(self.times) - 1)
+        return 0.0 if self.hit else min(clearance(self.judge, place)[0] for place in self.places[first::4])
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """What happens around a flight."""
+
+    camera: EventCamera
+    server: EventServer
+    frame_s: float
+    longest_s: float
+    wrong: CameraFault
+    """What goes wrong with the camera."""
+    strikes_at: float = np.inf
+    """When it does, simulated seconds, or something else."""
+    strike: Callable[[], None] = lambda: None
+    """Called then."""
+    after_s: float = 0.0
+    """So long the vehicle is judged after its autopilot has left, if something went wrong."""
 
 
 def fly_missions(environment: Environment, setup: Setup) -> Iterator[Mission]:
@@ -144,7 +185,7 @@ def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         out = folder if setup.out is None else setup.out / f"mission-{number}"
-        see = _covered(_see(environment, number, setup, stack), setup)
+        see = _see(environment, number, setup, stack)
         camera = EventCamera(see, lambda attitude: camera_rotation(attitude, config.camera.mount))
         server = EventServer(setup.size)
         stack.callback(server.close)
@@ -153,7 +194,8 @@ def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
         port, let_go = hold_udp_port()
         stack.callback(let_go)
         yaw = float(np.arctan2(goal[1] - start[1], goal[0] - start[0]))
-        words = _vehicle_words(start, yaw, port, keeper.address, number)
+        strikes_at = moment_of(setup.fault_s, number)
+        words = _vehicle_words(start, yaw, port, keeper.address, number, setup.fault, strikes_at)
         vehicle = stack.enter_context(_process(words, quiet=False))
         words = _autopilot_words(config, scene, port, server.address, keeper.address, out, setup)
         autopilot = stack.enter_context(_process(words, quiet=True))
@@ -161,38 +203,51 @@ def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
         let_go()
         began = time.monotonic()
         longest = EXTRA_S + _mission_s(config, setup.pace)
-        why = _conduct(keeper, camera, server, flight, setup.frame_s, longest)
+        wrong = CameraFault(setup.fault, setup.size, setup.frame_s, number)
+        stage = Stage(camera, server, setup.frame_s, longest, wrong)
+        if setup.fault is not None and setup.fault != Fault.FENCE:
+            of_process = functools.partial(strike, autopilot, setup.fault)
+            stage = dataclasses.replace(stage, strikes_at=strikes_at, strike=of_process, after_s=AFTER_S)
+        why = _conduct(keeper, flight, stage)
         speed = keeper.now / (time.monotonic() - began)
         keeper.close()
         _wait(autopilot)
         return _judged(number, flight, out, camera.seen / max(keeper.now, 1e-9), speed, why)
 
 
-def _conduct(
-    keeper: Keeper, camera: EventCamera, server: EventServer, flight: Flight, frame_s: float, longest_s: float
-) -> str:
+def _conduct(keeper: Keeper, flight: Flight, stage: Stage) -> str:
     """Lets vehicle, camera and autopilot take their turns until the autopilot or the flight has ended.
 
     Returns:
         Why the flight has ended, if the autopilot does not say it.
     """
-    frames, streamed = 0, -1
+    frames, streamed, alone_s = 0, -1, None
     position = quaternion = None
     while True:
         told = keeper.collect()
         if told.get("vehicle"):
             position, quaternion = flight.add(told["vehicle"])
-        if keeper.members() != {"vehicle", "autopilot"} or flight.hit or keeper.now > longest_s:
+        members = keeper.members()
+        if "autopilot" not in members and alone_s is None:
+            alone_s = keeper.now
+        lingers = alone_s is not None and flight.fault_s is not None and keeper.now < alone_s + stage.after_s
+        if "vehicle" not in members or flight.hit or keeper.now > stage.longest_s or not (alone_s is None or lingers):
             break
-        if position is not None and quaternion is not None and frames * frame_s <= keeper.next_wake():
-            keeper.pass_time(frames * frame_s)
-            streamed, events = camera.frame(keeper.now, position, quaternion)
-            server.send(streamed, events)
+        if flight.fault_s is None and keeper.now >= stage.strikes_at and alone_s is None:
+            flight.fault_s = keeper.now
+            stage.strike()
+        if position is not None and quaternion is not None and frames * stage.frame_s <= keeper.next_wake():
+            keeper.pass_time(frames * stage.frame_s)
+            late_s = keeper.now - stage.strikes_at
+            until, events = stage.camera.frame(keeper.now, position, quaternion, stage.wrong.light(late_s))
+            if (sent := stage.wrong.sent(until, events, late_s)) is not None:
+                streamed = until
+                stage.server.send(until, sent)
             frames += 1
         else:
             keeper.wake_first(streamed)
     flight.judge_now()
-    if keeper.now > longest_s:
+    if keeper.now > stage.longest_s:
         return "time out"
     return "the autopilot was lost" if "vehicle" in keeper.members() else "the vehicle was lost"
 
@@ -213,9 +268,11 @@ def _judged(number: int, flight: Flight, out: Path, events_hz: float, speed: flo
         outcome = why
     elif outcome == "goal" and not flight.reached:
         outcome = "beside the goal"
-    return Mission(
-        number, outcome, end.get("seconds", 0.0), flight.least_clearance(), end.get("latency", {}), events_hz, speed
-    )
+    seconds, latency = end.get("seconds", 0.0), end.get("latency", {})
+    clearance_m, struck = flight.least_clearance(), flight.fault_s
+    after_m = None if struck is None else flight.least_clearance(struck)
+    mode = next((name for name, numbers in MODES[PX4].items() if numbers == flight.mode), "other")
+    return Mission(number, outcome, seconds, clearance_m, latency, events_hz, speed, struck, after_m, mode)
 
 
 def _see(environment: Environment, number: int, setup: Setup, stack: contextlib.ExitStack) -> pictures.See:
@@ -228,23 +285,13 @@ def _see(environment: Environment, number: int, setup: Setup, stack: contextlib.
     return drawn.see
 
 
-def _covered(see: pictures.See, setup: Setup) -> pictures.See:
-    """Returns pictures of which the light is gone after a while; one is drawn each `frame_s`."""
-    if setup.cover_s is None:
-        return see
-    numbers, since = itertools.count(1), setup.cover_s
-
-    def look(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-        late = max(0.0, next(numbers) * setup.frame_s - since)
-        return see(position, rotation) * np.exp(-late / COVERING_S)
-
-    return look
-
-
-def _vehicle_words(start: NDArray, yaw: float, port: int, clock: str, seed: int) -> list[str]:
+def _vehicle_words(
+    start: NDArray, yaw: float, port: int, clock: str, seed: int, fault: str | None, fault_s: float
+) -> list[str]:
     place = [repr(float(each)) for each in start]
     words = ["-m", "edqn_jax.fly.simulated.vehicle", "--mavlink", f"udpout:127.0.0.1:{port}", "--start", *place]
-    return [*words, f"--yaw={yaw!r}", "--seed", str(seed), "--clock", clock]
+    words += [f"--yaw={yaw!r}", "--seed", str(seed), "--clock", clock]
+    return [*words, "--fault", fault, "--fault-s", repr(fault_s)] if fault in OF_VEHICLE else words
 
 
 def _autopilot_words(
@@ -253,6 +300,9 @@ def _autopilot_words(
     def numbers(values: Any) -> list[str]:
         return [repr(float(each)) for each in np.asarray(values, np.float64).ravel()]
 
+    fence = ()
+    if setup.fault == Fault.FENCE:
+        fence = ("--fence", *numbers(fence_of(scene.start, scene.goal, scene.volume)))
     return [
         *("-m", "edqn_jax", "fly", str(setup.policy)),
         *("--mavlink", f"udpin:127.0.0.1:{port}", "--events", f"tcp:{events}"),
@@ -260,7 +310,7 @@ def _autopilot_words(
         *("--contrast", repr(CONTRAST), "--goal", *numbers(scene.goal), "--volume", *numbers(scene.volume)),
         *("--origin", *numbers(scene.start), "--goal-radius", repr(config.env.goal_radius_m - MARGIN_M)),
         *("--pace", repr(setup.pace), "--max-s", repr(_mission_s(config, setup.pace))),
-        *("--out", str(out), "--clock", clock, *setup.autopilot),
+        *("--out", str(out), "--clock", clock, *fence, *setup.autopilot),
     ]
 
 

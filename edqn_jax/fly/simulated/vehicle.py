@@ -19,9 +19,11 @@ from edqn_jax.errors import ConfigError, error_sentence
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.fly import frames
 from edqn_jax.fly.clocks import Clock, WallClock
+from edqn_jax.fly.faults import Fault
 from edqn_jax.fly.link import connect
+from edqn_jax.fly.simulated.injected import DRIFT_M_S, JUMP_M, LEFT, MASTER_S, OF_VEHICLE, second_master
 from edqn_jax.fly.simulated.lockstep import SimulatedClock
-from edqn_jax.fly.simulated.manners import LAND, OFFBOARD, UNSUPPORTED, Limits, Manners
+from edqn_jax.fly.simulated.manners import LAND, OFFBOARD, POSITION, UNSUPPORTED, Limits, Manners
 from edqn_jax.interop.outer.poses import Body
 from edqn_jax.interop.outer.rotorpy_body import STEP_S, RotorPyBody
 
@@ -55,6 +57,9 @@ class Vehicle:
         self._drift, self._battery = np.zeros(3), args.battery
         self._wires = [connect(address, 1, 1) for address in args.mavlink]
         self._steps = 0
+        self._fault, self._fault_steps = args.fault, round(args.fault_s / STEP_S)
+        aside = np.random.default_rng([args.seed, 1]).uniform(0.0, 2.0 * np.pi)
+        self._aside = np.array([np.cos(aside), np.sin(aside), 0.0])
 
     @property
     def clock_s(self) -> float:
@@ -65,7 +70,8 @@ class Vehicle:
         """Takes what has come, flies `STEP_S` seconds, tells what is due."""
         for wire in self._wires:
             while (message := wire.recv_msg()) is not None:
-                self._take(message, wire)
+                if not self._is(Fault.LOST_LINK):
+                    self._take(message, wire)
         body = self._body.state()
         yaw = frames.angles_of(body.quaternion)[2]
         velocity, heading = self.manners.wanted(self.clock_s, yaw, body.position[2] - self._ground)
@@ -74,7 +80,9 @@ class Vehicle:
         self._steps += 1
         self._drift += self._random.normal(0.0, DRIFT_M * np.sqrt(STEP_S), 3)
         self._battery -= STEP_S / 1200.0
-        self._tell()
+        self._go_wrong()
+        if not self._is(Fault.LOST_LINK):
+            self._tell()
 
     def truth(self) -> bytes:
         """Returns where it is, as `TRUTH`."""
@@ -86,6 +94,26 @@ class Vehicle:
         """Closes its endpoints."""
         for wire in self._wires:
             wire.close()
+
+    def _is(self, fault: Fault) -> bool:
+        """Returns whether this fault has begun."""
+        return self._fault == fault and self._steps >= self._fault_steps
+
+    def _go_wrong(self) -> None:
+        """Does what a fault that has begun does to the vehicle itself."""
+        since = self._steps - self._fault_steps
+        if self._is(Fault.BATTERY):
+            self._battery = min(self._battery, LEFT)
+        elif self._is(Fault.DRIFT):
+            self._drift += DRIFT_M_S * STEP_S * self._aside
+        elif self._is(Fault.JUMP) and since == 0:
+            self._drift += JUMP_M * self._aside
+        elif self._is(Fault.TAKEN_OVER) and since == 0:
+            self.manners.mode = POSITION
+        elif self._is(Fault.SECOND_MASTER) and since % round(MASTER_S / STEP_S) == 0:
+            self.manners.take_setpoint(np.zeros(3), frames.angles_of(self._body.state().quaternion)[2], self.clock_s)
+            for wire in self._wires:
+                wire.write(second_master())
 
     def _take(self, message: Any, wire: Any) -> None:
         kind = message.get_type()
@@ -109,7 +137,7 @@ class Vehicle:
         return 0 if message.command == 511 else UNSUPPORTED
 
     def _tell(self) -> None:
-        if self._steps % 4 == 0:
+        if self._steps % 4 == 0 and not self._is(Fault.STALE):
             self._tell_state(self._body.state())
         if self._steps % 40 == 0:
             landed = 2 if self.manners.airborne else 1
@@ -150,6 +178,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=0, help="of the estimator's errors")
     parser.add_argument("--unarmed", action="store_true", help="on the ground, motors off")
     parser.add_argument("--seconds", type=float, default=np.inf, help="ends after so long")
+    parser.add_argument("--fault", choices=list(map(str, OF_VEHICLE)), help="that strikes in flight")
+    parser.add_argument("--fault-s", type=float, default=0.0, help="when it strikes, its own seconds")
     parser.add_argument("--clock", help="HOST:PORT of a simulation's clock")
     return parser.parse_args(argv)
 
