@@ -58,13 +58,16 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=FAULTS, help="(default all)")
     parser.add_argument("--missions", type=at_least_one, default=20, help="with each fault (default 20)")
     parser.add_argument("--jobs", type=at_least_one, default=1, help="flown at once (default 1)")
+    parser.add_argument(
+        "--camera", nargs=2, type=at_least_one, default=[346, 260], metavar=("W", "H"), help="its pixels"
+    )
     parser.add_argument("--seed", type=int, default=33, help="of the test worlds (default 33)")
     return parser.parse(argv)
 
 
 def struck(fault: str, mission: Mission) -> bool:
     """Returns whether the fault came before the flight had ended."""
-    return mission.outcome == fault if fault == Fault.FENCE else mission.fault_s is not None
+    return mission.fault_s is not None or mission.outcome == fault  # a fence is left by an estimate first
 
 
 def ended_as_configured(fault: str, mission: Mission) -> bool:
@@ -80,20 +83,29 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
         rows = [measure_fault(policy, file, fault, args) for fault in args.faults]
-    return {**json_report.machine(jax.devices()), "world": args.world, "seed": args.seed, "rows": rows}
+    about = {"world": args.world, "seed": args.seed, "camera": args.camera}
+    return {**json_report.machine(jax.devices()), **about, "rows": rows}
+
+
+def stopped_at(setup: Setup, moment_s: float | None) -> Setup:
+    """Returns a setup in which a pilot takes over at a moment, simulated seconds, and nothing else goes wrong."""
+    assert moment_s is not None, "a flight that collides after its fault has had one"
+    return dataclasses.replace(setup, fault=Fault.TAKEN_OVER, fault_s=(moment_s, moment_s))
 
 
 def measure_fault(policy: Policy, file: Path, fault: str, args: argparse.Namespace) -> dict[str, Any]:
     """Returns how the flights with a fault ended, and prints their row."""
-    setup, asked = Setup(file, fault=fault), (args.world, policy.config, args.missions, args.seed)
+    setup, asked = (
+        Setup(file, (args.camera[0], args.camera[1]), fault=fault),
+        (args.world, policy.config, args.missions, args.seed),
+    )
     flown = sorted(fly_at_once(*asked, setup, jobs=args.jobs), key=lambda each: each.number)
     came = [each for each in flown if struck(fault, each)]
     hit = [each for each in came if each.outcome == "collision"]
     twins = []
     if hit and fault != Fault.TAKEN_OVER:
         environment = environment_of(*asked)
-        stopped = dataclasses.replace(setup, fault=Fault.TAKEN_OVER)
-        twins = [fly_mission(environment, each.number, stopped) for each in hit]
+        twins = [fly_mission(environment, each.number, stopped_at(setup, each.fault_s)) for each in hit]
     avoidable = sum(twin.outcome != "collision" for twin in twins)
     right = sum(ended_as_configured(fault, each) for each in came)
     clear = [each.clearance_after_m for each in came if each.clearance_after_m is not None and each not in hit]

@@ -80,10 +80,11 @@ KINDS: dict[str, tuple[int, tuple[str, ...]]] = {
     "looks": (220_000_000, LOOKS),
     "further": (185_000_000, (*LOOKS, *AGAIN, "--encoder.retrain-at", "0.05", "0.35")),
     "autopilot": (370_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, "--encoder.retrain-at", "0.05", "0.35")),
-    "body": (230_000_000, (*LOOKS, *AGAIN, *BODY, "--encoder.retrain-at", "0.06", "0.3")),
+    "body": (150_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, *BODY, "--encoder.retrain-at", "0.06", "0.3")),
 }
 """Decisions of each seed, 0 as `DECISIONS`, and further options, by the kind of policy: of one plaid, of any look, the
-latter trained further, for a slow autopilot, and with a camera on the body; these three begin with one of any look."""
+latter trained further, for a slow autopilot, and for one with a camera on the body; these three begin with one of any
+look."""
 
 MISSIONS = 1000
 """Test worlds of each family; training never uses them."""

@@ -27,6 +27,7 @@ class Fault(enum.StrEnum):
     NO_EVENTS = "no events"
     BURST = "burst of events"
     COVERED = "covered lens"
+    DARK = "gone dark"
     LATE = "late decision"
 
 
@@ -46,7 +47,7 @@ ACTIONS: Mapping[Fault, Action] = {
 }
 """What is done about each fault unless it is configured otherwise. A flight that was taken over is left alone."""
 
-PASSING = frozenset({Fault.STALE, Fault.NO_EVENTS, Fault.BURST, Fault.LATE})
+PASSING = frozenset({Fault.STALE, Fault.NO_EVENTS, Fault.BURST, Fault.DARK, Fault.LATE})
 """Faults after which a flight goes on, once they have been gone for `Settings.clear_s`."""
 
 
@@ -234,6 +235,7 @@ def faults_of(watched: Watch, inputs: Inputs, now: float, settings: Settings) ->
         Fault.NO_EVENTS: is_old(inputs.packet_at, now, limits.silent_s),
         Fault.BURST: inputs.rate_hz > limits.burst_hz,
         Fault.COVERED: is_old(watched.seen_at, now, limits.unseen_s if watched.is_open else limits.covered_s),
+        Fault.DARK: watched.is_dark,
     }
     yield from (fault for fault in Fault if found.get(fault))
 

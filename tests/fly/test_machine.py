@@ -56,7 +56,8 @@ FAULTS: dict[Fault, tuple[Change, float]] = {
     Fault.DRIFT: (lambda now, since: moved(now, (0.0, since, 0.0)), 2.5),
     Fault.NO_EVENTS: (lambda now, since: dataclasses.replace(now, packet_at=(now.packet_at or 0.0) - since), 0.12),
     Fault.BURST: (lambda now, since: dataclasses.replace(now, rate_hz=2e7), 0.0),
-    Fault.COVERED: (covered, 0.42),
+    Fault.COVERED: (covered, 0.0),
+    Fault.DARK: (lambda now, since: dataclasses.replace(now, darkening=5.0, rate_hz=2e5), 0.0),
 }
 """What each fault does, and how soon it must be noticed, seconds."""
 
@@ -87,7 +88,8 @@ def ends_as_configured(fault: Fault, time: float) -> None:
 def test_an_action_can_be_chosen_for_each_fault(fault: Fault, action: Action) -> None:
     change, _ = FAULTS[fault]
     flown = fly(settings(actions={fault: action}), change, 6.0)
-    assert flown.vehicle.mode == action and Phase.HOVERING not in flown.phases
+    assert flown.vehicle.mode == action
+    assert (Phase.HOVERING in flown.phases) is (fault is Fault.COVERED)  # of which it is told after it has gone dark
 
 
 @pytest.mark.parametrize("fault", sorted(PASSING & FAULTS.keys()), ids=str)
@@ -147,7 +149,7 @@ def test_a_cover_that_closes_slowly_is_one() -> None:
         return dataclasses.replace(inputs, darkening=darkening, rate_hz=4e6 if since < 0.7 else 200.0)
 
     flown = fly(settings(), closes, 5.0)
-    assert flown.state.outcome == Fault.COVERED and not flown.moves_after(5.7 + 0.5)
+    assert flown.state.outcome == Fault.COVERED and not flown.moves_after(5.0 + 2 * TICK_S)
 
 
 def test_a_passing_fault_that_comes_back_ends_the_flight() -> None:

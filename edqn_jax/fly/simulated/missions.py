@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.config import Config
 from edqn_jax.evaluation.judge import MujocoWorld, clearance, load_judge, replay_contact
-from edqn_jax.fly.faults import Fault
+from edqn_jax.fly.faults import Fault, is_inside
 from edqn_jax.fly.link import MODES, PX4
 from edqn_jax.fly.records import RECORDS, read_records
 from edqn_jax.fly.simulated.camera import EventCamera, EventServer
@@ -156,10 +156,20 @@ class Stage:
     """What goes wrong with the camera."""
     strikes_at: float = np.inf
     """When it does, simulated seconds, or something else."""
+    fence: NDArray[np.float64] | None = None
+    """[2, 3] To leave it is what goes wrong, whenever that is."""
     strike: Callable[[], None] = lambda: None
     """Called then."""
     after_s: float = 0.0
     """So long the vehicle is judged after its autopilot has left, if something went wrong."""
+
+    def comes(self, now: float, position: NDArray[np.float64] | None) -> bool:
+        """Returns whether it goes wrong now, simulated seconds, with the vehicle at a position [3]."""
+        return (
+            now >= self.strikes_at
+            if self.fence is None
+            else position is not None and not is_inside(position, self.fence)
+        )
 
 
 def fly_missions(environment: Environment, setup: Setup) -> Iterator[Mission]:
@@ -205,9 +215,11 @@ def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
         longest = EXTRA_S + _mission_s(config, setup.pace)
         wrong = CameraFault(setup.fault, setup.size, setup.frame_s, number)
         stage = Stage(camera, server, setup.frame_s, longest, wrong)
-        if setup.fault is not None and setup.fault != Fault.FENCE:
+        if setup.fault is not None:
+            fence = fence_of(start, goal, scene.volume) if setup.fault == Fault.FENCE else None
             of_process = functools.partial(strike, autopilot, setup.fault)
-            stage = dataclasses.replace(stage, strikes_at=strikes_at, strike=of_process, after_s=AFTER_S)
+            when = np.inf if fence is not None else strikes_at
+            stage = dataclasses.replace(stage, strikes_at=when, fence=fence, strike=of_process, after_s=AFTER_S)
         why = _conduct(keeper, flight, stage)
         speed = keeper.now / (time.monotonic() - began)
         keeper.close()
@@ -233,10 +245,14 @@ def _conduct(keeper: Keeper, flight: Flight, stage: Stage) -> str:
         lingers = alone_s is not None and flight.fault_s is not None and keeper.now < alone_s + stage.after_s
         if "vehicle" not in members or flight.hit or keeper.now > stage.longest_s or not (alone_s is None or lingers):
             break
-        if flight.fault_s is None and keeper.now >= stage.strikes_at and alone_s is None:
+        if flight.fault_s is None and alone_s is None and stage.comes(keeper.now, position):
+            flight.judge_now()  # so that what was hit before is not hit after it
+            if flight.hit:
+                break
             flight.fault_s = keeper.now
             stage.strike()
-        if position is not None and quaternion is not None and frames * stage.frame_s <= keeper.next_wake():
+        sees = position is not None and quaternion is not None and alone_s is None
+        if sees and frames * stage.frame_s <= keeper.next_wake():
             keeper.pass_time(frames * stage.frame_s)
             late_s = keeper.now - stage.strikes_at
             until, events = stage.camera.frame(keeper.now, position, quaternion, stage.wrong.light(late_s))
