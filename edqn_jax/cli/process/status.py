@@ -151,17 +151,28 @@ def shown_status(argv: Sequence[str], outputs: Sequence[Lasting]) -> Iterator[No
         argv: words of the command.
         outputs: of `lasting_streams`; the line makes way for what is written to them.
     """
-    error = next((output for output in outputs if output.fileno() == 2), None)
+    error = _standard_error(outputs)
     if error is None or any(word.partition("=")[0] == "--clock" for word in argv):
         yield
         return
-    lives = error.isatty() and os.environ.get("TERM") not in (None, "", "dumb")
     command = _command_of(argv)
-    if not lives and (command in ("", "completion") or {"-h", "--help", "--help-all", "--version"} & set(argv)):
+    at_once = command in ("", "completion") or {"-h", "--help", "--help-all", "--version"} & set(argv)
+    if at_once and not _is_live(error):
+        yield
+        return
+    with status_of(f"edqn {command}".rstrip(), outputs):
+        yield
+
+
+@contextlib.contextmanager
+def status_of(title: str, outputs: Sequence[Lasting]) -> Iterator[None]:
+    """Shows within the block what a program of this title does, unless standard error is closed or another's."""
+    error = _standard_error(outputs)
+    if error is None:
         yield
         return
     sys.stderr.flush()
-    status = Status(f"edqn {command}".rstrip(), error.fileno(), lives=lives)
+    status = Status(title, error.fileno(), lives=_is_live(error))
     for output in outputs:
         output.watch(status.make_way)
     _shown.append(status)
@@ -170,6 +181,15 @@ def shown_status(argv: Sequence[str], outputs: Sequence[Lasting]) -> Iterator[No
         yield
     finally:
         end_status()
+
+
+def _standard_error(outputs: Sequence[Lasting]) -> Lasting | None:
+    return next((output for output in outputs if output.fileno() == 2), None)
+
+
+def _is_live(error: Lasting) -> bool:
+    """Returns whether one line can be drawn over and over."""
+    return error.isatty() and os.environ.get("TERM") not in (None, "", "dumb")
 
 
 def _command_of(argv: Sequence[str]) -> str:
