@@ -23,7 +23,7 @@ BEGAN = time.monotonic()
 TICK_S = 0.25
 """Between two drawings of the line on a terminal."""
 
-SILENT_S = 2.5
+SILENT_S = 2.0
 """Time without a line elsewhere after which one is printed; with `TICK_S` and a busy machine's delay less than 3 s."""
 
 UNEVEN = ("flying the missions", "validating")
