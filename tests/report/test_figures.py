@@ -351,4 +351,4 @@ def test_what_is_above_start_and_goal_is_cut_off_and_a_map_is_a_slice(roofed: Sc
     assert list(is_occluded(floor, oblique.shown, MAP)) == [True, True]
     assert list(is_occluded(floor, above.shown, MAP)) == [False, True]
     outside = dataclasses.replace(roofed, start=np.array([1.0, 5.0, 2.5]), goal=np.array([19.0, 5.0, 3.0]))
-    assert make_cutaway(outside, MAP).note == ""
+    assert make_cutaway(outside, MAP).cut is None
