@@ -23,6 +23,7 @@ from typing import Any
 import jax
 
 from conventional_stack.settings import DRONES, PACKAGES, SETTINGS, supported_config
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.evaluation.missions import run_missions
@@ -63,12 +64,14 @@ def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
     from conventional_stack.fleet import Course
     from conventional_stack.train import Steady
 
+    show_phase("compiling and warming up")
     course = Course.of(run_missions(config).training.env_params)
     turns: dict[tuple[int, int], list[float]] = {setting: [] for setting in SETTINGS}
     with ExitStack() as stack:
         runs = {setting: stack.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}
         for _ in range(repeats):  # in turns, so that a change in the machine's speed affects all settings
             for setting, run in runs.items():
+                show_phase("measuring", sum(map(len, turns.values())), repeats * len(SETTINGS))
                 turns[setting].append(run.turn(decisions))
         rows = [
             {

@@ -19,22 +19,22 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
-    "sphinxcontrib.mermaid",
     "extensions.pages",
     "extensions.notebooks",
     "extensions.docstrings",
     "extensions.fields",
+    "extensions.formulas",
 ]
 exclude_patterns = ["images/README.md", "extensions", "_templates", "_static"]
 templates_path = ["_templates"]
 
-# Pages are read on GitHub too, which shows math between dollars and in fences, and diagrams in fences, as Sphinx does.
+# Pages are read on GitHub too, which shows math between dollars and in fences, as Sphinx does.
 myst_enable_extensions = ["dollarmath"]
-myst_fence_as_directive = ["math", "mermaid"]
+myst_fence_as_directive = ["math"]
+html_math_renderer = "mathml"
 myst_heading_anchors = 4
 nb_execution_mode = "off"
 nb_merge_streams = True

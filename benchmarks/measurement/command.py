@@ -1,13 +1,16 @@
-"""What the commands of all benchmarks share: help, `--json`, and a sentence with exit code 2 for invalid input."""
+"""What the commands of all benchmarks share: help, `--json`, a clock, and a sentence and code 2 for invalid input."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from edqn_jax.cli.process.status import status_of
+from edqn_jax.cli.process.streams import lasting_streams
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.files import check_can_write
@@ -69,14 +72,28 @@ def at_least_one(text: str) -> int:
 
 
 def in_a_sentence(main: Callable[..., int]) -> Callable[..., int]:
-    """Returns a `main` that prints what is wrong with its input, or which package is missing, and returns 2."""
+    """Returns a `main` that prints what is wrong with its input, or which package is missing, and returns 2.
+
+    While it measures, standard error has a line with a clock, as those of `edqn` have.
+    """
 
     @functools.wraps(main)
     def command(*arguments: object) -> int:
         try:
-            return main(*arguments)
+            with shown_clock():
+                return main(*arguments)
         except (ConfigError, MissingPackageError) as error:
             print(error, file=sys.stderr)
             return 2
 
     return command
+
+
+@contextlib.contextmanager
+def shown_clock() -> Iterator[None]:
+    """Shows within the block the name of this program and the time that it takes, unless it is asked for its help."""
+    if {"-h", "--help"} & set(sys.argv[1:]):
+        yield
+        return
+    with lasting_streams() as outputs, status_of(Path(sys.argv[0]).stem, outputs):
+        yield

@@ -37,7 +37,7 @@ from edqn_jax.runs.directory import Resume, RunDirectory, plan_run_directory
 if TYPE_CHECKING:
     from edqn_jax.interop import tracking
     from edqn_jax.learn.policy import Policy
-    from edqn_jax.report.progress import Progress
+    from edqn_jax.training.progress import Progress
 
 
 SHORT_NAMES = {
@@ -267,10 +267,11 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
 
 def _open_progress(writes: bool) -> Progress:
     """Returns what shows the progress of a run, in place of the status where that is a panel with clocks of its own."""
-    from edqn_jax.report.progress import Progress
+    from edqn_jax.training.progress import Progress, has_panel
 
-    tell = (lambda *_: end_status()) if sys.stdout.isatty() else show_phase
-    return Progress(Console(quiet=not writes), tell=tell, began=BEGAN)
+    console = Console(quiet=not writes)
+    tell = (lambda *_: end_status()) if has_panel(console) else show_phase
+    return Progress(console, tell=tell, began=BEGAN)
 
 
 def _warnings(config: Config, start: Policy | None) -> tuple[str, ...]:

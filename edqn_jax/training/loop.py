@@ -27,6 +27,7 @@ from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.history import DivergenceMonitor, EndedEpisodes, History, chunk_metrics, mean_metrics
+from edqn_jax.training.progress import shown_progress
 from edqn_jax.training.selection import Candidate, choose_candidate, is_due, make_candidate
 from edqn_jax.training.setup import TrainingSetup, set_up_training
 
@@ -118,6 +119,7 @@ def train(
     reward: Reward | None = None,
     callback: Callback | None = None,
     start: Policy | None = None,
+    progress: bool | None = None,
 ) -> TrainingResult:
     """Trains a policy and returns it with the history of its training; nothing is written.
 
@@ -126,6 +128,8 @@ def train(
         reward: replaces the configured reward; see `sim.task.reward.Transition` for what it is given.
         callback: called after each chunk; training stops where it returns True.
         start: policy whose networks training begins with; camera, sensor, encoder and network are as in its config.
+        progress: whether phases, clocks and metrics are shown on standard error, or below a notebook's cell. Without it
+            they are on a terminal and in a notebook.
 
     Raises:
         ConfigError: if the configuration is invalid, the world cannot be flown, or `start` has networks of other
@@ -133,7 +137,8 @@ def train(
         DivergedError: if numbers are not finite for so long that nothing is learnt any more.
         CheckError: with `train.debug`, at the first fault.
     """
-    with set_up_training(_given(config), reward, start=start) as preparation:
+    given = _given(config)
+    with shown_progress(progress) as display, set_up_training(given, reward, display, start=start) as preparation:
         return run_chunks(preparation, callback)[0]
 
 
@@ -145,13 +150,15 @@ def train_seeds(
     reward: Reward | None = None,
     callback: Callback | None = None,
     start: Policy | None = None,
+    progress: bool | None = None,
 ) -> list[TrainingResult]:
     """Trains one policy for each of several seeds, in one compiled program; arguments and errors as `train`.
 
     Args:
         seeds: how many; they are `train.seed`, `train.seed + 1` and so on.
     """
-    with set_up_training(_given(config), reward, agents=seeds, start=start) as preparation:
+    given = _given(config)
+    with shown_progress(progress) as display, set_up_training(given, reward, display, seeds, start) as preparation:
         return run_chunks(preparation, callback)
 
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +13,7 @@ import pytest
 
 from edqn_jax.extras import MissingPackageError
 from measurement.command import Parser, at_least_one, in_a_sentence
+from tests.support.processes import PATIENCE_S, ROOT
 
 
 @in_a_sentence
@@ -49,3 +54,25 @@ def test_the_help_says_what_is_timed(capsys: pytest.CaptureFixture[str]) -> None
     said = capsys.readouterr().out
     assert "python benchmarks/example.py" in said and "Times an example." in said and "It takes a second." in said
     assert "write the report to this file" in said
+
+
+MEASURES = """
+import sys
+from measurement.command import in_a_sentence
+
+
+@in_a_sentence
+def main() -> int:
+    print("measured")
+    return 3
+
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize(("words", "said"), [((), r"-c: starting, 0:0\d\n"), (("--help",), "")])
+def test_a_benchmark_has_a_clock_on_standard_error(words: tuple[str, ...], said: str) -> None:
+    environ = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'benchmarks'}"}
+    started = [sys.executable, "-c", MEASURES, *words]
+    ended = subprocess.run(started, capture_output=True, text=True, env=environ, timeout=PATIENCE_S)
+    assert (ended.returncode, ended.stdout) == (3, "measured\n") and re.fullmatch(said, ended.stderr)

@@ -106,10 +106,18 @@ def test_a_pipe_gets_a_line_after_each_long_silence(written: tuple[int, int], mo
     status.start()
     status.phase("compiling")
     assert read_until(reads, b"\n") == b"edqn train: starting, 0:00\n"
-    for _ in range(2):
+    # The first line of a phase has the command's name and clock; those after it are short.
+    for begins in (b"edqn train: compiling, 0:0", b"  compiling, 0:0", b"  compiling, 0:0"):
         status._printed -= SILENT_S
-        assert read_until(reads, b"\n").startswith(b"edqn train: compiling, 0:")
+        assert read_until(reads, b"\n").startswith(begins)
+    status.phase("flying", 3, 4)
+    status._printed -= SILENT_S
+    assert read_until(reads, b"\n").startswith(b"edqn train: flying, 3 of 4, 0:0")
     status.stop()
+
+
+def test_a_pipe_is_never_silent_for_three_seconds() -> None:
+    assert SILENT_S + 2 * statuses.TICK_S <= 3.0
 
 
 def test_a_line_never_ends_what_somebody_else_has_begun(

@@ -22,7 +22,7 @@ LIVE = """
 import sys, time
 from rich.console import Console
 from edqn_jax.cli.process.streams import lasting_streams
-from edqn_jax.report.progress import Progress
+from edqn_jax.training.progress import Progress
 with lasting_streams():
     progress = Progress(Console(force_terminal=True))
     progress.phase("training", total=100)

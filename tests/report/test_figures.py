@@ -118,11 +118,19 @@ def test_the_map_of_a_closed_world_shows_a_door_open():
     door = np.array([[10.0, 12, 2]])
     assert not is_occluded(door, above.shown, MAP)[0]
     assert is_occluded(np.array([[10.0, 5, 2]]), above.shown, MAP)[0]
-    assert not make_cutaway(hall, OBLIQUE).passable and not make_cutaway(a_hall(beside, over), MAP).passable
+    assert not make_cutaway(hall, OBLIQUE).passable
+
+
+def test_the_map_of_walls_as_high_as_the_volume_shows_a_door_open_without_a_ceiling():
+    beside, over = a_box((10, 5, 3), (0.1, 5, 3)), a_box((10, 12, 5), (0.1, 2, 1))
+    above = make_cutaway(a_hall(beside, over), MAP)
+    assert [solid.corners[:, 2].min() for solid in above.passable] == [4.0]  # over the box there is the sky
+    assert not is_occluded(np.array([[10.0, 12, 2]]), above.shown, MAP)[0]
+    assert above.note == "open is pale" and not make_cutaway(a_hall(beside, over), OBLIQUE).passable
 
 
 def test_a_beam_is_no_ceiling():
-    assert make_cutaway(a_hall(BEAM), MAP).note == ""
+    assert not make_cutaway(a_hall(BEAM), MAP).has_ceiling
 
 
 def test_a_picture_says_what_was_cut_away(tmp_path):
@@ -343,4 +351,4 @@ def test_what_is_above_start_and_goal_is_cut_off_and_a_map_is_a_slice(roofed: Sc
     assert list(is_occluded(floor, oblique.shown, MAP)) == [True, True]
     assert list(is_occluded(floor, above.shown, MAP)) == [False, True]
     outside = dataclasses.replace(roofed, start=np.array([1.0, 5.0, 2.5]), goal=np.array([19.0, 5.0, 3.0]))
-    assert make_cutaway(outside, MAP).note == ""
+    assert make_cutaway(outside, MAP).cut is None

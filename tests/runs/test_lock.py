@@ -12,11 +12,11 @@ import pytest
 
 from edqn_jax.config import Config, WorldConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory, plan_run_directory
 from edqn_jax.runs.lock import LOCK, Lock
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
+from edqn_jax.training.progress import Progress
 from tests.support.processes import PATIENCE_S
 
 HOLDER = """

@@ -13,11 +13,11 @@ from edqn_jax.config import WorldConfig
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.interop.recordings.flight_events import flight_recording
 from edqn_jax.report.gallery import prepare_gallery
-from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.runs.verification.verify import verify_run
+from edqn_jax.training.progress import Progress
 from tests.support.configs import TINY_RUN
 
 WORLD = WorldConfig(name="sparse", flown="", pool_size=2, missions=8, balls=3)

@@ -15,11 +15,11 @@ from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.learn import trainer
 from edqn_jax.learn.state import Episodes
 from edqn_jax.report.gallery import prepare_gallery
-from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
+from edqn_jax.training.progress import Progress
 from tests.support.configs import TINY_RUN
 from tests.support.miniature import no_losses
 

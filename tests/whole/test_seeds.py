@@ -14,7 +14,6 @@ from edqn_jax.config import WorldConfig
 from edqn_jax.errors import ConfigError, DivergedError, StoppedError
 from edqn_jax.learn import trainer
 from edqn_jax.report.gallery import prepare_gallery
-from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory, to_plain_json
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.record import train_run
@@ -22,6 +21,7 @@ from edqn_jax.runs.stopping import Stop
 from edqn_jax.runs.verification.verify import verify_run
 from edqn_jax.training import history
 from edqn_jax.training.loop import train, train_seeds
+from edqn_jax.training.progress import Progress
 from tests.support.configs import BLIND_RUN, FIGURES
 from tests.support.miniature import WORLD as MINIATURE_WORLD
 

@@ -22,13 +22,13 @@ from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS
 from edqn_jax.report.gallery import prepare_gallery
-from edqn_jax.report.progress import Progress
 from edqn_jax.runs.checkpoints.params import POLICY, save_params
 from edqn_jax.runs.directory import RunDirectory, to_plain_json
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.runs.verification.verify import verify_run
+from edqn_jax.training.progress import Progress
 from tests.support.configs import FIGURES, TINY_RUN
 from tests.support.processes import ROOT
 
@@ -37,7 +37,7 @@ import sys, time
 from pathlib import Path
 from tests import conftest
 from edqn_jax.report.gallery import prepare_gallery
-from edqn_jax.report.progress import Progress
+from edqn_jax.training.progress import Progress
 from edqn_jax.runs import checkpointer
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.record import train_run

@@ -1,7 +1,8 @@
 """What a command is doing, on standard error, from its first moment on: a line that ticks, or one now and then.
 
 A terminal has one line that is drawn anew four times a second and is gone once something else is printed. Elsewhere,
-as in a log, a line stands at the beginning, and another after every ten seconds in which nothing was printed.
+as in a log, a line stands at the beginning, and another after every `SILENT_S` in which nothing was printed: with the
+command's name and its clock where a phase is named for the first time, and short where it goes on.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ BEGAN = time.monotonic()
 TICK_S = 0.25
 """Between two drawings of the line on a terminal."""
 
-SILENT_S = 10.0
-"""Longest time without a line elsewhere."""
+SILENT_S = 2.0
+"""Time without a line elsewhere after which one is printed; with `TICK_S` and a busy machine's delay less than 3 s."""
 
 UNEVEN = ("flying the missions", "validating")
 """Phases whose parts end late and together, as flights do that are flown at once: how many are done says little of
@@ -48,6 +49,7 @@ class Status:
         self._began = self._phase_began = self._printed = time.monotonic()
         self._name, self._done, self._total = "starting", 0, 0
         self._is_shown, self._is_at_start = False, True  # of a line on the terminal
+        self._named = ""  # phase of the last line in a log
 
     def start(self) -> None:
         """Shows the first line and goes on until `stop`."""
@@ -75,16 +77,16 @@ class Status:
                 self._clear()
                 self._is_at_start = data.endswith(b"\n")
 
-    def line(self, now: float) -> str:
-        """Returns the line at a time of `time.monotonic`."""
+    def line(self, now: float, *, is_short: bool = False) -> str:
+        """Returns the line at a time of `time.monotonic`; a short one names the phase and its clock alone."""
         took = now - self._phase_began
-        parts = [f"{self._title}: {self._name}"]
+        parts = [f"  {self._name}" if is_short else f"{self._title}: {self._name}"]
         if self._total:
             parts.append(f"{self._done:,} of {self._total:,}")
         parts.append(_clock(took))
         if 0 < self._done < self._total and self._name not in UNEVEN:
             parts.append(f"about {_clock(took / self._done * (self._total - self._done))} left")
-        if now - self._began > took + 1.0:
+        if not is_short and now - self._began > took + 1.0:
             parts.append(f"{_clock(now - self._began)} in all")
         return ", ".join(parts)
 
@@ -97,14 +99,14 @@ class Status:
 
     def _show(self) -> None:
         now = time.monotonic()
-        text = self.line(now)
+        text = self.line(now, is_short=not self._lives and self._name == self._named)
         if self._lives:
             columns = shutil.get_terminal_size().columns
             self._write(_CLEARED + text[: columns - 1].encode("ascii", "replace"))
             self._is_shown = True
         else:
             self._write(f"{text}\n".encode("ascii", "replace"))
-            self._printed = now
+            self._printed, self._named = now, self._name
 
     def _clear(self) -> None:
         if self._is_shown:
@@ -149,17 +151,28 @@ def shown_status(argv: Sequence[str], outputs: Sequence[Lasting]) -> Iterator[No
         argv: words of the command.
         outputs: of `lasting_streams`; the line makes way for what is written to them.
     """
-    error = next((output for output in outputs if output.fileno() == 2), None)
+    error = _standard_error(outputs)
     if error is None or any(word.partition("=")[0] == "--clock" for word in argv):
         yield
         return
-    lives = error.isatty() and os.environ.get("TERM") not in (None, "", "dumb")
     command = _command_of(argv)
-    if not lives and (command in ("", "completion") or {"-h", "--help", "--help-all", "--version"} & set(argv)):
+    at_once = command in ("", "completion") or {"-h", "--help", "--help-all", "--version"} & set(argv)
+    if at_once and not _is_live(error):
+        yield
+        return
+    with status_of(f"edqn {command}".rstrip(), outputs):
+        yield
+
+
+@contextlib.contextmanager
+def status_of(title: str, outputs: Sequence[Lasting]) -> Iterator[None]:
+    """Shows within the block what a program of this title does, unless standard error is closed or another's."""
+    error = _standard_error(outputs)
+    if error is None:
         yield
         return
     sys.stderr.flush()
-    status = Status(f"edqn {command}".rstrip(), error.fileno(), lives=lives)
+    status = Status(title, error.fileno(), lives=_is_live(error))
     for output in outputs:
         output.watch(status.make_way)
     _shown.append(status)
@@ -168,6 +181,15 @@ def shown_status(argv: Sequence[str], outputs: Sequence[Lasting]) -> Iterator[No
         yield
     finally:
         end_status()
+
+
+def _standard_error(outputs: Sequence[Lasting]) -> Lasting | None:
+    return next((output for output in outputs if output.fileno() == 2), None)
+
+
+def _is_live(error: Lasting) -> bool:
+    """Returns whether one line can be drawn over and over."""
+    return error.isatty() and os.environ.get("TERM") not in (None, "", "dumb")
 
 
 def _command_of(argv: Sequence[str]) -> str:

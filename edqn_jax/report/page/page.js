@@ -185,7 +185,8 @@
         drone.position.copy(position);
         drone.quaternion.copy(turn);
         const riding = !this.controls.enabled, far = riding ? 160 : chosen ? 40 : 90;
-        const scale = Math.max(1, position.distanceTo(this.camera.position) / far);
+        const least = chosen ? 1 : Math.min(1, reach(world) / 40);  // a hundred others would fill a small room
+        const scale = Math.max(least, position.distanceTo(this.camera.position) / far);
         drone.children.forEach((part) => { if (part.name === "body") part.scale.setScalar(scale); });
         if (chosen) {
           const cut = position.z + 1;

@@ -159,7 +159,7 @@ class CutawayView:
     cut: tuple[float, float] | None = None
     """Heights, metres, between which a shape is shown."""
     passable: list[Solid] = dataclasses.field(default_factory=list)
-    """On a map of a closed world: what can be flown under or over, such as the wall above a door; drawn pale."""
+    """On a map: the wall above a door, and what else can be flown under or, below a ceiling, over; drawn pale."""
 
     @property
     def note(self) -> str:
@@ -177,7 +177,8 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
     """Returns a world as it is drawn: without its ceiling, without outer walls before the eye, and what moves apart.
 
     On a map of a world with a ceiling, what leaves a gap of `PASSABLE_M` above or below it is apart, too: else the wall
-    above a door would close it.
+    above a door would close it. In one without, whose volume ends at the height of its walls, what reaches that height
+    and leaves a gap below it is.
 
     A ceiling is a box or another shape in the upper half of the volume that covers nearly all of it, or a plane
     that looks down there; an outer wall runs along nearly a whole side of the volume.
@@ -203,17 +204,18 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
             near_walls.append(solid)
         else:
             shown.append(solid)
-    passable = [solid for solid in shown if _is_passable(solid, lower[2], upper[2])]
-    if view.elevation < 89 or not has_ceiling:
-        passable = []
+    passable = []
+    if view.elevation >= 89:
+        passable = [solid for solid in shown if _is_passable(solid, lower[2], upper[2], has_ceiling)]
     shown = [solid for solid in shown if not any(solid is each for each in passable)]
     return CutawayView(shown, near_walls, has_ceiling, moving_solids(scene, 0.0), cut, passable)
 
 
-def _is_passable(solid: Solid, floor: float, ceiling: float) -> bool:
-    """Whether a drone fits under or over a solid."""
+def _is_passable(solid: Solid, floor: float, ceiling: float, has_ceiling: bool) -> bool:
+    """Whether a drone fits under or over a solid; without a ceiling, under one over which there is no way."""
     heights = solid.corners[:, 2]
-    return bool(heights.min() - floor >= PASSABLE_M or ceiling - heights.max() >= PASSABLE_M)
+    under, over = heights.min() - floor >= PASSABLE_M, ceiling - heights.max() >= PASSABLE_M
+    return bool(under or over) if has_ceiling else bool(under and not over)
 
 
 def boundary_side(solid: Solid, lower: np.ndarray, upper: np.ndarray) -> tuple[int, int] | None:

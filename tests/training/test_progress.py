@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import io
+import sys
+import threading
+from collections.abc import Callable
+from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from edqn_jax.report.progress import Progress, format_duration
+from edqn_jax.errors import ConfigError
+from edqn_jax.training import progress as module
+from edqn_jax.training.loop import train, train_seeds
+from edqn_jax.training.progress import Progress, format_duration, has_panel, shown_progress
+from tests.support.configs import BLIND_RUN
+from tests.support.processes import PATIENCE_S
 
 
 def shown(terminal: bool, every_s: float) -> str:
@@ -93,7 +103,7 @@ def test_what_a_learner_of_ones_own_tells_is_shown_by_its_name(terminal: bool) -
 def test_the_estimate_is_made_of_training_alone(monkeypatch):
     """A warm-up at 1 decision a second and a retraining at 2 do not count: 600 decisions left at 10 a second."""
     now, out = [0.0], io.StringIO()
-    monkeypatch.setattr("edqn_jax.report.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("edqn_jax.training.progress.time.monotonic", lambda: now[0])
     progress = Progress(Console(file=out, width=200), every_s=0.0)
     progress.phase("training", total=1000)
     for seconds, decisions, phase in ((100, 100, "warm-up"), (110, 200, "training"), (160, 300, "retraining")):
@@ -108,7 +118,7 @@ def test_the_estimate_is_made_of_training_alone(monkeypatch):
 def test_the_estimate_follows_a_machine_that_becomes_slower(monkeypatch):
     """600 decisions at 10 a second, then at 1: after some minutes the 100 that are left take nearly 100 s."""
     now, out = [0.0], io.StringIO()
-    monkeypatch.setattr("edqn_jax.report.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("edqn_jax.training.progress.time.monotonic", lambda: now[0])
     progress = Progress(Console(file=out, width=200), every_s=0.0, began=-20.0)
     progress.phase("training", total=1000)
     for decisions in (*range(10, 610, 10), *range(610, 910, 10)):
@@ -123,7 +133,7 @@ def test_the_estimate_follows_a_machine_that_becomes_slower(monkeypatch):
 def test_the_estimate_does_not_jump_after_a_validation(monkeypatch):
     """Ten decisions a second, and a validation of 60 s after each 300: a fifth of the time is validating."""
     now, out = [0.0], io.StringIO()
-    monkeypatch.setattr("edqn_jax.report.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("edqn_jax.training.progress.time.monotonic", lambda: now[0])
     progress = Progress(Console(file=out, width=200), every_s=0.0)
     progress.phase("training", total=30_000)
     estimates = []
@@ -149,3 +159,80 @@ def test_stopping_what_never_started_is_harmless():
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0:00"), (75, "1:15"), (3675, "1:01:15")])
 def test_clock_reads_like_one(seconds, text):
     assert format_duration(seconds) == text
+
+
+def test_a_dumb_terminal_has_lines_and_no_panel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It shows a panel only once that has ended."""
+    monkeypatch.setenv("TERM", "dumb")
+    assert not has_panel(Console(force_terminal=True))
+    assert shown(terminal=True, every_s=0.0).splitlines()[0] == "[0:00] compiling"
+
+
+def test_below_a_cell_one_panel_is_drawn_anew_and_its_last_state_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock goes on while the host waits, and the output is text, small enough to be kept in a notebook."""
+    states: list[str] = []
+    ticked = threading.Event()
+
+    def update(data: dict[str, str], *, raw: bool) -> None:
+        assert raw and list(data) == ["text/plain"]
+        states.append(data["text/plain"])
+        if len(states) > 3:
+            ticked.set()
+
+    def display(data: dict[str, str], *, raw: bool, display_id: bool) -> Any:
+        assert display_id
+        update(data, raw=raw)
+        return SimpleNamespace(update=update)
+
+    ipython: Any = ModuleType("IPython.display")
+    ipython.display = display
+    monkeypatch.setitem(sys.modules, "IPython", ModuleType("IPython"))
+    monkeypatch.setitem(sys.modules, "IPython.display", ipython)
+    monkeypatch.setattr(module, "CELL_EVERY_S", 0.01)
+    progress = Progress(Console(force_jupyter=True))
+    progress.phase("preparing worlds")
+    assert ticked.wait(PATIENCE_S)
+    progress.phase("training", total=1000)
+    progress.update({"phase": "training", "decisions": 300, "success_rate": 0.25})
+    progress.stop()
+    assert "preparing worlds" in states[0] and "300 / 1,000" in states[-1] and "25.0%" in states[-1]
+    assert "\x1b" not in states[-1] and max(map(len, states[-1].splitlines())) == module.CELL_COLUMNS
+    assert not any(thread.name == "cell panel" for thread in threading.enumerate())
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_python_shows_a_training_on_a_terminal_unless_told_otherwise(
+    is_terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Stream(io.StringIO):
+        def isatty(self) -> bool:
+            return is_terminal
+
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("FORCE_COLOR", "1")  # says nothing of a terminal
+
+    def said(progress: bool | None) -> str:
+        monkeypatch.setattr(sys, "stderr", Stream())
+        with shown_progress(progress) as display:
+            assert (display is not None) == (progress or (progress is None and is_terminal))
+            if display is not None:
+                display.phase("compiling")
+        return sys.stderr.getvalue()  # pyright: ignore[reportAttributeAccessIssue]
+
+    assert said(False) == ""
+    assert ("compiling" in said(None)) == is_terminal
+    assert "compiling" in said(True)
+
+
+@pytest.mark.parametrize("call", [train, lambda config, **given: train_seeds(2, config, **given)])
+def test_training_in_python_tells_its_phases(
+    call: Callable[..., object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stopped(*_: object) -> None:
+        raise ConfigError("far enough")
+
+    monkeypatch.setattr("edqn_jax.training.setup.missions_of_runs", stopped)
+    for progress, said in ((True, "[0:00] preparing worlds\n"), (False, ""), (None, "")):
+        with pytest.raises(ConfigError, match="far enough"):
+            call(BLIND_RUN, progress=progress)
+        assert capsys.readouterr() == ("", said)

@@ -1,10 +1,14 @@
-"""Progress of a run: a live panel on a terminal, a line every few seconds elsewhere."""
+"""Progress of a run: a live panel on a terminal and in a notebook, a line every few seconds elsewhere."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import sys
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from importlib import import_module
 from typing import Any
 
 from rich.console import Console, Group
@@ -39,8 +43,49 @@ MAX_OWN = 6
 FORGOTTEN_S = 60.0
 """After so many seconds a measurement counts half for the time that is left: machines become slower and faster."""
 
+CELL_COLUMNS = 100
+"""Width of the panel below a notebook's cell, in characters."""
+
+CELL_EVERY_S = 1.0
+"""Between two drawings of the panel below a notebook's cell."""
+
 LASTING = ("episodes", "success_rate", "validation_success", "mean_return")
 """Metrics that stay on show until a newer value comes; the others vanish where a chunk has none."""
+
+
+class CellPanel:
+    """Panel below a notebook's cell, drawn anew by a thread, as `rich.live.Live` does on a terminal.
+
+    It is one output of plain text: what a notebook keeps of a training is the last panel.
+    """
+
+    def __init__(self, panel: Callable[[], Panel]) -> None:
+        """Shows nothing before `start`; `panel` returns what is shown."""
+        self._panel, self._ended = panel, threading.Event()
+        self._thread = threading.Thread(target=self._tick, name="cell panel", daemon=True)
+        self._handle: Any = None
+
+    def start(self) -> None:
+        """Shows the panel and goes on until `stop`."""
+        display = import_module("IPython.display").display
+        self._handle = display(self._data(), raw=True, display_id=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Leaves the last state."""
+        self._ended.set()
+        self._thread.join()
+        self._handle.update(self._data(), raw=True)
+
+    def _tick(self) -> None:
+        while not self._ended.wait(CELL_EVERY_S):
+            self._handle.update(self._data(), raw=True)
+
+    def _data(self) -> dict[str, str]:
+        console = Console(file=io.StringIO(), width=CELL_COLUMNS, force_jupyter=False, color_system=None)
+        with console.capture() as text:
+            console.print(self._panel())
+        return {"text/plain": text.get().rstrip()}
 
 
 class Progress:
@@ -53,7 +98,7 @@ class Progress:
         tell: ShowPhase = show_nothing,
         began: float | None = None,
     ) -> None:
-        """Writes to `console`, or standard output; without a terminal, a line for each phase and each `every_s`.
+        """Writes to `console`, or standard output; without terminal or notebook, a line for each phase and `every_s`.
 
         `tell` is called with the name of each phase, and with how much of it is done. The clock runs from `began` on,
         seconds of `time.monotonic`, or from now on.
@@ -61,7 +106,7 @@ class Progress:
         self._tell = tell
         self._console = console or Console()
         self._every_s = every_s
-        self._live: Live | None = None
+        self._live: Live | CellPanel | None = None
         self._metrics: dict[str, Any] = {}
         self._phase, self._total, self._counted = "starting", 0, (0, 0)
         self._phase_started = time.monotonic()
@@ -88,7 +133,7 @@ class Progress:
         if total:
             self._metrics.setdefault("decisions", done)
             self._updated = (time.monotonic(), self._decisions())
-        if self._console.is_terminal:
+        if has_panel(self._console):
             self._start_live()
         elif not returning:
             self.message(f"[{format_duration(self.elapsed_s)}] {name}")
@@ -121,7 +166,10 @@ class Progress:
             self._live = None
 
     def _start_live(self) -> None:
-        if self._live is None:
+        if self._live is None and self._console.is_jupyter:
+            self._live = CellPanel(self._panel)
+            self._live.start()
+        elif self._live is None:
             # Drawn anew by a thread of its own, so that the clock runs on while the host waits.
             # What is printed meanwhile appears above it, unless it goes into a pipe.
             self._live = Live(
@@ -199,3 +247,31 @@ class Progress:
             values.add_row(*(Text(label, style="dim") for label, _ in shown))
             values.add_row(*(value for _, value in shown))
         return Panel(Group(head, values) if shown else head, title="edqn", title_align="left")
+
+
+def has_panel(console: Console) -> bool:
+    """Returns whether a console shows a panel that is drawn anew, as notebooks and most terminals can."""
+    return console.is_jupyter or (console.is_terminal and not console.is_dumb_terminal)
+
+
+@contextlib.contextmanager
+def shown_progress(progress: bool | None) -> Iterator[Progress | None]:
+    """Shows within the block, on standard error or below a notebook's cell, what a training in Python does.
+
+    Args:
+        progress: True shows it anywhere, False nowhere, None on a terminal and in a notebook.
+
+    Yields:
+        what takes phases and metrics; None if nothing is shown.
+    """
+    console = Console(stderr=True)
+    if progress is None:
+        progress = has_panel(console) and (console.is_jupyter or sys.stderr.isatty())  # FORCE_COLOR is no terminal
+    if not progress:
+        yield None
+        return
+    shown = Progress(console)
+    try:
+        yield shown
+    finally:
+        shown.stop()
