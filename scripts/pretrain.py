@@ -6,8 +6,8 @@ r"""Makes a policy that comes with the package: trains five seeds, measures the 
         --out runs/looks-further
     python scripts/pretrain.py --kind autopilot --world narrow --start-from runs/looks-further --run runs/autopilot \
         --out edqn_jax/policies/pretrained-looks
-    python scripts/pretrain.py --kind body --start-from runs/looks-first --run runs/body \
-        --out edqn_jax/policies/pretrained-body
+    python scripts/pretrain.py --kind body --world narrow --start-from edqn_jax/policies/pretrained-looks \
+        --run runs/body --out edqn_jax/policies/pretrained-body
 
 Training needs a GPU: for `mixed` worlds 24 minutes on two H100, 16 of them training (`train.py ... --train.devices 2`,
 with the options that this script has), for `open` ones eight on one. Where --run holds the seeds already, the best is
