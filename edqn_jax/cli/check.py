@@ -76,14 +76,13 @@ def check_command(args: CheckArgs) -> None:
     show_phase("looking at the world")
 
     from edqn_jax.evaluation.world_check import check_world
-    from edqn_jax.policies.functions import config_of
     from edqn_jax.runs.directory import to_plain_json
-    from edqn_jax.runs.policies import find_policy
+    from edqn_jax.runs.policies import find_config
 
     for file in (args.out, args.json):
         if file is not None:
             check_can_write(file)
-    config = config_of(find_policy(args.policy, args.world))
+    config = find_config(args.policy, args.world)
     found = check_world(config, args.world, seed=args.seed, start=args.start, goal=args.goal)
     Console().print(check_table(found, str(args.policy)))
     for line in (*filter(None, [found.note]), *found.warnings):

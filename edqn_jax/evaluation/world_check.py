@@ -14,14 +14,14 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.devices.memory import bytes_of
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import MissionSet, check_group
-from edqn_jax.evaluation.places import Point, moved_ends, place_world
+from edqn_jax.evaluation.places import Point, check_seed, moved_ends, place_in_file, place_world
 from edqn_jax.planning.path import point_text
 from edqn_jax.planning.widest import WidestWay, find_widest_way, is_roomy
 from edqn_jax.policies.sizes import describe_larger, sorted_sides
 from edqn_jax.policies.unseen import describe_unseen
 from edqn_jax.sim.camera.native import kinds_for_jax
-from edqn_jax.sim.scene.distance import shape_distances
-from edqn_jax.sim.scene.mjcf import SceneError, check_scene, check_volume, load_world, resolve_world
+from edqn_jax.sim.scene.distance import distances_to_shapes
+from edqn_jax.sim.scene.mjcf import LoadedWorld, SceneError, check_scene, check_volume, load_world, resolve_world
 from edqn_jax.sim.scene.scene import Scene, scene_shapes
 from edqn_jax.sim.scene.shapes.kind import kind_of
 from edqn_jax.sim.scene.survey import Survey, survey_world
@@ -151,12 +151,15 @@ def check_world(
     """
     if group.is_multi_drone(config):
         check_group(config, name, config.env.drones, moved_ends(start, goal))
+    check_seed(seed)
     found = WorldCheck(name, config, trained_in=trained_sizes(config))
-    if name not in FAMILIES:
-        found = _survey(found, name)
-        if found.refusal is not None:
+    if name in FAMILIES:
+        placed = place_world(config, name, seed, start, goal)
+    else:
+        found, loaded = _survey(found, name)
+        if loaded is None:
             return found
-    placed = place_world(config, name, seed, start, goal)
+        placed = place_in_file(config, name, loaded, moved_ends(start, goal))
     scene, radius = placed.scene, config.drone.body_radius_m
     try:
         check_volume(scene, placed.title)
@@ -266,8 +269,8 @@ def estimate_cost(config: Config, scene: Scene) -> Cost:
     )
 
 
-def _survey(found: WorldCheck, name: str) -> WorldCheck:
-    """Returns what became of a file's geoms.
+def _survey(found: WorldCheck, name: str) -> tuple[WorldCheck, LoadedWorld | None]:
+    """Returns what became of a file's geoms, and its world, None of one that is refused.
 
     Raises:
         ConfigError: if it cannot be read at all.
@@ -282,8 +285,8 @@ def _survey(found: WorldCheck, name: str) -> WorldCheck:
         first, more = survey.refused[0], len(survey.refused) - 1
         others = f", and {more} more" if more else ""
         refusal = f"'{name}' has geoms that cannot be flown: '{first.name}' {first.why}{others}"
-        return dataclasses.replace(found, survey=survey, refusal=refusal)
-    return dataclasses.replace(found, survey=survey_world(path, loaded))
+        return dataclasses.replace(found, survey=survey, refusal=refusal), None
+    return dataclasses.replace(found, survey=survey_world(path, loaded)), loaded
 
 
 def _warnings(found: WorldCheck, title: str) -> tuple[str, ...]:
@@ -345,7 +348,7 @@ def _warn_of_pictures(scene: Scene, title: str) -> list[str]:
 def _nearest_shape(scene: Scene, way: WidestWay, names: Mapping[str, tuple[str, ...]]) -> str:
     """Returns the name of the shape nearest to the tightest place of a way, or its kind and number."""
     point = jnp.asarray(way.points[way.tightest], jnp.float32)
-    distances = {kind: np.asarray(each) for kind, each in shape_distances(scene, point).items()}
+    distances = {kind: np.asarray(each) for kind, each in distances_to_shapes(scene, point).items()}
     if not distances:
         return "nothing"
     kind = min(distances, key=lambda each: distances[each].min())

@@ -33,7 +33,7 @@ _MOST_FINE = 4_000_000  # cells that a second search may take
 STRIDE_M = 0.02
 """Shortest step of a check along a leg; undetected penetration of at most 0.01^2 / 2 r = 0.14 mm."""
 
-_LANES = (64, 512, 4096, 32768)  # batches are padded to one of these, to compile few programs
+_LANES = (64, 4096, 32768)  # batches are padded to one of these, to compile few programs
 
 
 def is_small(scene: Scene, cell: float) -> bool:

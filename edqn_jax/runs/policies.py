@@ -16,7 +16,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_make, write_atomically
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.policies import function_named, no_run, policy_folder
-from edqn_jax.policies.functions import FunctionPolicy, as_policy, check_has_params, load_function
+from edqn_jax.policies.functions import FunctionPolicy, as_policy, check_has_params, config_of, load_function
 from edqn_jax.runs import world_copy
 from edqn_jax.runs.checkpoints.params import load_params, policy_file, save_params
 from edqn_jax.runs.checkpoints.sealed import file_digest
@@ -49,6 +49,23 @@ def find_policy(name: str | Path, world: str | Path | None = None) -> Policy | F
     return as_policy(load_function(str(name)), world)
 
 
+def find_config(name: str | Path, world: str | Path | None = None) -> Config:
+    """Returns the configuration of the policy that a command names, whose parameters are not looked at.
+
+    Args:
+        name: as `find_policy`.
+        world: likewise.
+
+    Raises:
+        ConfigError: if there is none, or its configuration is not one.
+    """
+    if function_named(name) is not None:
+        return config_of(find_policy(name, world))
+    folder, file = _folder_of(Path(name))
+    policy_file(folder / "checkpoints")
+    return world_copy.with_copied_worlds(folder, _config_in(file))[0]
+
+
 @as_tested
 def save_policy(policy: Policy, folder: str | Path) -> None:
     """Writes a policy into `folder`, for `load_policy` and `edqn evaluate`; the folder must be new or empty.
@@ -79,13 +96,7 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
             the process was forked after JAX had been used.
     """
     check_not_forked()
-    folder = policy_folder(folder)
-    file = folder / "config.yaml"
-    if not file.is_file():
-        raise no_run(folder)
-    seeds = sorted(folder.glob(f"{SEED_FOLDER}*/"))
-    if seeds:
-        raise ConfigError(f"'{folder}' holds the runs of {len(seeds)} seeds; name one of them, such as '{seeds[0]}'")
+    folder, file = _folder_of(folder)
     try:
         return _loaded(folder, file)
     except ConfigError as error:
@@ -97,12 +108,33 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
         ) from None
 
 
-def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
+def _folder_of(name: Path) -> tuple[Path, Path]:
+    """Returns the folder of a policy, and the file of its configuration.
+
+    Raises:
+        ConfigError: if there is none, or the folder holds the runs of several seeds.
+    """
+    folder = policy_folder(name)
+    file = folder / "config.yaml"
+    if not file.is_file():
+        raise no_run(folder)
+    seeds = sorted(folder.glob(f"{SEED_FOLDER}*/"))
+    if seeds:
+        raise ConfigError(f"'{folder}' holds the runs of {len(seeds)} seeds; name one of them, such as '{seeds[0]}'")
+    return folder, file
+
+
+def _config_in(file: Path) -> Config:
     layer = load_layer(file)
     if not layer:
         raise ConfigError(f"'{file}' is empty: it does not say what the policy beside it is")
     config = apply_layer(Config(), layer, str(file))
     validate(config, trains=False)
+    return config
+
+
+def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
+    config = _config_in(file)
     params = load_params(folder / "checkpoints", file)
     fresh = jax.eval_shape(lambda: fresh_policy(config))
     if _shapes(params) != _shapes(fresh):

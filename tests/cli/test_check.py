@@ -44,6 +44,20 @@ def test_a_world_that_is_flown_ends_with_0_and_writes_what_was_asked_for(
     assert found["policy"] == "pretrained" and len(found["geoms"]) == 3 and len(found["trained_in_m"]) == 6
 
 
+def test_the_parameters_of_the_policy_are_not_read_and_the_world_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    corridor(tmp_path, 1.4)
+    read = []
+    policies, world_check = import_module("edqn_jax.runs.policies"), import_module("edqn_jax.evaluation.world_check")
+    load = world_check.load_world
+    monkeypatch.setattr(policies, "load_params", lambda *_: pytest.fail("parameters were read"))
+    for module in (world_check, import_module("edqn_jax.evaluation.places")):
+        monkeypatch.setattr(module, "load_world", lambda path: (read.append(path), load(path))[1])
+    assert main(["check", "corridor.xml"]) == 0
+    assert len(read) == 1
+
+
 def test_a_world_that_is_not_flown_ends_with_1_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     corridor(tmp_path, 0.0)
     assert main(["check", "corridor.xml", "--out", "map.png", "--json", "found.json"]) == 1

@@ -33,6 +33,10 @@ def shape_distances(scene: Scene, point: Array) -> dict[str, Array]:
     }
 
 
+distances_to_shapes = jax.jit(shape_distances)
+"""`shape_distances` as one program, for what is asked on the host."""
+
+
 def signed_distance(scene: Scene, point: Array) -> Array:
     """Returns metres from `point` [3] to the nearest surface of the scene, negative inside a shape.
 

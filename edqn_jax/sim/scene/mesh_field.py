@@ -23,7 +23,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.kept_grids import KEPT_VALUES, kept_values
-from edqn_jax.sim.scene.solid_distance import solid_distances, split_triangles
+from edqn_jax.sim.scene.solid_distance import points_on, solid_distances
 
 CELL_M = 0.1
 """Cell of a grid that is neither small nor very large, metres."""
@@ -51,6 +51,7 @@ _MANY = 1000  # triangles, of which distances are taken to planes
 _PLANES = 1000  # of such a hull's own, and as many more
 _BLOCK = 4  # points along each side of a block that shares candidates
 _AT_ONCE = 2**22  # numbers of an intermediate array
+_TOGETHER = 2**10  # triangles whose pieces fit a core's cache
 
 Numbers = NDArray[np.float64]
 
@@ -238,10 +239,11 @@ def _lowered_values_of_solid(triangles: Numbers, half: Numbers, cell: float, thi
     excess = np.zeros(middles.shape)
     excess[near] = np.maximum(_UNSEEN * (between[near] - middles[near]), 0.0)
     # At the surface itself both sides of something thin meet.
-    surface = split_triangles(triangles, cell).mean(1)
-    at = surface / cell + (counts - 1) / 2
-    places = np.minimum(at.astype(np.int64), counts - 2)
-    np.maximum.at(excess, tuple(places.T), _interpolated(exact, places, at - places))
+    for some in np.array_split(triangles, -(-len(triangles) // _TOGETHER)):
+        at = points_on(some, cell) / cell + (counts - 1) / 2
+        places = np.minimum(at.astype(np.int64), counts - 2)
+        cells = np.ravel_multi_index(tuple(places.T), excess.shape)
+        np.maximum.at(excess.reshape(-1), cells, _interpolated(exact, places, at - places))
     lowering = np.pad(excess, 1)
     for axis in range(3):
         moved = np.moveaxis(lowering, axis, 0)

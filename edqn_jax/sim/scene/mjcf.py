@@ -31,7 +31,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES
-from edqn_jax.sim.scene.distance import shape_distances
+from edqn_jax.sim.scene.distance import distances_to_shapes
 from edqn_jax.sim.scene.mjcf_parts import looks as mjcf_looks
 from edqn_jax.sim.scene.mjcf_parts.files import SceneError, load_checked_text
 from edqn_jax.sim.scene.mjcf_parts.geoms import check_grids, geom_name, is_solid, shape_of
@@ -251,7 +251,7 @@ def check_scene(
                     f"the {role} {_point(point)} lies outside the flight volume of {title}: "
                     f"{axis} = {value:g} is not within {low:g} to {high:g}"
                 )
-        for kind, distances in shape_distances(scene, jnp.asarray(point)).items():
+        for kind, distances in distances_to_shapes(scene, jnp.asarray(point, jnp.float32)).items():
             nearest = int(np.argmin(distances))
             distance = float(distances[nearest])
             if distance > body_radius:

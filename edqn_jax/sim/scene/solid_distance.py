@@ -25,7 +25,9 @@ EXACT_CELLS = 2.5
 """Cells from the surface up to which distances are exact."""
 
 _BLOCK = 4  # cells along each side of a block
-_PIECE_CELLS = 8.0  # longest edge of the pieces that blocks are compared with
+_PIECE_CELLS = 16.0  # longest edge of the pieces that blocks are compared with
+_PARTS = 4  # most parts along each edge of a triangle at whose middles a surface is looked at
+_STEP = 2  # cells to the neighbours whose nearest triangles a point far away is compared with
 _FAR_CELLS = 0.1  # that distances further away are too small, for they are not to the nearest of all triangles
 _AT_ONCE = 32  # pieces that a block is compared with in one pass
 _THREADS = 2
@@ -36,20 +38,45 @@ Numbers = NDArray[np.floating]
 Integers = NDArray[np.int64]
 
 
-def split_triangles(triangles: Numbers, longest: float) -> Numbers:
-    """Returns triangles [G, 3, 3] that cover the same surface, no edge of which is longer than `longest` metres."""
+def split_triangles(triangles: Numbers, longest_m: float) -> Numbers:
+    """Returns triangles [G, 3, 3] that cover the same surface, no edge of which is longer than `longest_m`."""
     left = np.ascontiguousarray(np.moveaxis(triangles, 0, -1))  # [3, 3, F], so that sums are over whole rows
+    squares = np.sum((np.roll(left, -1, axis=0) - left) ** 2, axis=1)  # [3, F] of the edges from each corner
     done = []
     while left.shape[-1]:
-        squares = np.sum((np.roll(left, -1, axis=0) - left) ** 2, axis=1)
-        long = squares.max(0) > longest**2
-        done.append(left[..., ~long])
-        left, first = left[..., long], squares[:, long].argmax(0)
-        # The longest edge is halved.
-        a, b, c = (np.take_along_axis(left, ((first + i) % 3)[None, None], axis=0)[0] for i in range(3))
-        middle = (a + b) / 2
-        left = np.concatenate([np.stack([a, middle, c]), np.stack([middle, b, c])], axis=-1)
+        longest = squares.max(0)
+        is_left = longest > longest_m**2
+        done.append(left[..., ~is_left])
+        halves, their = [], []
+        for k in range(3):
+            # The longest edge, from a to b, is halved.
+            which = np.flatnonzero(is_left & (squares[k] == longest))
+            is_left[which] = False
+            a, b, c = (left[(k + i) % 3].take(which, axis=1) for i in range(3))
+            to_b, to_c, to_a = (squares[(k + i) % 3].take(which) for i in range(3))
+            middle, quarter = (a + b) / 2, to_b / 4
+            across = (to_c + to_a) / 2 - quarter
+            halves += [np.stack([a, middle, c]), np.stack([middle, b, c])]
+            their += [np.stack([quarter, across, to_a]), np.stack([quarter, to_c, across])]
+        left, squares = np.concatenate(halves, axis=-1), np.concatenate(their, axis=-1)
     return np.moveaxis(np.concatenate([np.zeros((3, 3, 0)), *done], axis=-1), -1, 0)
+
+
+def points_on(triangles: Numbers, longest_m: float) -> Numbers:
+    """Returns points [P, 3] of a surface: the middles of triangles that cover it, no edge longer than `longest_m`."""
+    pieces = split_triangles(triangles, _PARTS * longest_m)
+    squares = np.max(np.sum((np.roll(pieces, -1, axis=1) - pieces) ** 2, axis=2), axis=1)
+    parts = np.maximum(np.ceil(np.sqrt(squares) / longest_m - 1e-9), 1)
+    found = [_middles_of_parts(n) @ pieces[parts == n] for n in range(1, _PARTS + 1)]
+    return np.concatenate([points.reshape(-1, 3) for points in found])
+
+
+def _middles_of_parts(n: int) -> Numbers:
+    """Returns the shares [n^2, 3] of its corners that the middles of a triangle's n^2 equal parts have."""
+    lower = [(3 * i + 1, 3 * j + 1) for i in range(n) for j in range(n - i)]
+    upper = [(3 * i + 2, 3 * j + 2) for i in range(n) for j in range(n - i - 1)]
+    b, c = np.array(lower + upper).T / (3 * n)
+    return np.stack([1 - b - c, b, c], axis=1)
 
 
 def lattice_axes(counts: NDArray[np.integer], cell: float) -> list[Numbers]:
@@ -92,13 +119,15 @@ def _far_distances(table: Array, nearest: NDArray[np.int32], near: NDArray[np.fl
     """Returns the distances of the points of a lattice at which those `near` [X, Y, Z] are infinite."""
     far = ~np.isfinite(near)
     index = distance_transform_edt(~(near < cell), return_distances=False, return_indices=True)
-    nearest = nearest[tuple(index)]  # type: ignore[index]
-    places = np.argwhere(far)
-    points = cell * (places - (np.array(near.shape) - 1) / 2)
+    nearest = np.pad(nearest[tuple(index)], _STEP, mode="edge")  # type: ignore[index]
+    places = np.argwhere(far).astype(np.int32)
+    points = (cell * (places - (np.array(near.shape) - 1) / 2)).astype(np.float32)
+    here, flat = np.ravel_multi_index(tuple(places.T + _STEP), nearest.shape), nearest.reshape(-1)
     found = np.full(len(places), np.inf, np.float32)
-    for step in (np.zeros(3, int), *np.eye(3, dtype=int), *-np.eye(3, dtype=int)):
-        there = np.clip(places + 2 * step, 0, np.array(near.shape) - 1)
-        found = np.minimum(found, _distances_to(table, nearest[tuple(there.T)], points))
+    for axis in range(3):
+        step = _STEP * nearest.strides[axis] // nearest.itemsize
+        for there in (here - step, here + step, *([here] if axis == 0 else [])):
+            np.minimum(found, _distances_to(table, flat[there], points), out=found)
     return found
 
 
@@ -159,9 +188,14 @@ def _near_distances(
     # A block holds its corners and the middles of its cells.
     first = np.clip(np.floor(low - reach / side - 1 + 0.5 / _BLOCK).astype(np.int64), 0, blocks)
     last = np.clip(np.floor(high + reach / side).astype(np.int64) + 1, 0, blocks)
-    boxes = _boxes(first, last - first)
-    pairs = [(owner, np.ravel_multi_index(tuple(place.T), tuple(blocks))) for owner, place in boxes]
-    owner, block = (np.concatenate([np.zeros(0, np.int64), *each]) for each in zip(*pairs, strict=True))
+    middle, most = side / 2 - cell / 4, reach + np.sqrt(3) * (side / 2 - cell / 4)
+    owners, numbers = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for owner, place in _boxes(first, last - first):
+        # The box around a triangle reaches further than the triangle.
+        is_near = _distances_to(table, owner, corner + side * place + middle) <= most
+        owners.append(owner[is_near])
+        numbers.append(np.ravel_multi_index(tuple(place[is_near].T), tuple(blocks)))
+    owner, block = np.concatenate(owners), np.concatenate(numbers)
     order = np.argsort(block, kind="stable")
     used, begin, number = np.unique(block[order], return_index=True, return_counts=True)
     places = np.stack(np.unravel_index(used, tuple(blocks)), axis=1)
@@ -245,7 +279,7 @@ def _squares_to(table: Array, numbers: Array, points: Array) -> Array:
     return _squares(list(table[numbers].T), list(points.T))
 
 
-def _distances_to(table: Array, numbers: NDArray[np.int32], points: Numbers) -> NDArray[np.float32]:
+def _distances_to(table: Array, numbers: NDArray[np.integer], points: Numbers) -> NDArray[np.float32]:
     """Returns the distance [P] of each point [P, 3] to the triangle of its number, metres."""
     found = []
     for i in range(0, len(points), _PAIRS):

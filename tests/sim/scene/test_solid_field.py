@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from edqn_jax.sim.scene.grid_boxes import MOST_BOXES, boxes_of_grid
 from edqn_jax.sim.scene.mesh_field import CELL_M, Grid, _cell_for, grid_of_mesh
-from edqn_jax.sim.scene.solid_distance import EXACT_CELLS, lattice_axes, solid_distances, split_triangles
+from edqn_jax.sim.scene.solid_distance import EXACT_CELLS, lattice_axes, points_on, solid_distances, split_triangles
 from tests.oracles.mesh_distance import signed_distances
 
 TURN = Rotation.from_euler("xyz", [20, 35, 50], degrees=True).as_matrix()
@@ -126,6 +126,25 @@ def test_split_triangles_cover_the_same_area_and_are_small() -> None:
     edges = np.linalg.norm(parts - np.roll(parts, 1, axis=1), axis=2)
     assert edges.max() <= 0.3
     assert trimesh.triangles.area(parts).sum() == pytest.approx(trimesh.triangles.area(triangles).sum())
+
+
+@pytest.mark.parametrize("parts", range(1, 5))
+def test_points_on_a_triangle_are_the_middles_of_its_equal_parts(parts: int) -> None:
+    triangle = np.array([[[0, 0, 1], [3, 0, 1], [0, 3, 1]]], float)
+    points = points_on(triangle, 1.001 * np.sqrt(18) / parts)
+    x = points * parts  # thirds of a part beside each corner of the parts
+    lower = {(3 * i + 1, 3 * j + 1) for i in range(parts) for j in range(parts - i)}
+    upper = {(3 * i + 2, 3 * j + 2) for i in range(parts) for j in range(parts - i - 1)}
+    assert {tuple(each) for each in np.round(x[:, :2]).astype(int)} == lower | upper
+    assert len(points) == parts**2 and np.allclose(points[:, 2], 1) and np.allclose(x[:, :2], np.round(x[:, :2]))
+
+
+def test_of_points_on_a_surface_the_next_one_is_near() -> None:
+    triangles = np.array([[[0, 0, 0], [7, 0, 0], [0.3, 0.4, 0.2]]])
+    points = points_on(triangles, 0.1)
+    shares = np.random.default_rng(0).dirichlet(np.ones(3), 2000)
+    apart = np.linalg.norm((shares @ triangles[0])[:, None] - points, axis=-1).min(1)
+    assert apart.max() <= 0.1 * 2 / 3
 
 
 def test_a_grid_is_drawn_as_boxes_around_what_is_filled() -> None:
