@@ -24,7 +24,7 @@ class WorldArgs:
     """Make a world of a scan: an MJCF file, and the mesh that it names."""
 
     scan: Annotated[Positional[Path], arg(metavar="FILE")]
-    """A mesh or a cloud of points, a .ply, .obj, .stl or .glb, or an OctoMap, a .bt."""
+    """A mesh or a cloud of points, a .ply, .obj, .stl or .glb, points alone, an .xyz or .pcd, or an OctoMap, a .bt."""
     out: Annotated[Path, arg(metavar="DIR")]
     """Folder for the world, a new one."""
     scale: Annotated[float, arg(metavar="M")] = 1.0

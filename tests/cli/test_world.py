@@ -11,6 +11,7 @@ import trimesh
 from edqn_jax.cli import main
 from edqn_jax.sim.scene import scan
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of
+from edqn_jax.sim.scene.point_files import read_points
 from tests.support.octomaps import octomap_of
 
 ROOM = (8.0, 5.0, 3.0)
@@ -88,6 +89,74 @@ def test_a_cloud_of_points_has_a_thickness(capsys: pytest.CaptureFixture[str]) -
     flown_inside("here")
 
 
+def pcd(points: np.ndarray, how: str, fields: str = "x y z", count: int | None = None) -> bytes:
+    """A file of the Point Cloud Library, with an intensity before its points and two bytes after them."""
+    head = (
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS i {fields} _ _\nSIZE 8 4 4 4 1 1\n"
+        f"TYPE F F F F U U\nCOUNT 2 1 1 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {len(points) if count is None else count}\nDATA {how}\n"
+    )
+    if how != "binary":
+        return (head + "\n".join(f"7 7 {x:.5f} {y:.5f} {z:.5f} 0 0" for x, y, z in points) + "\n").encode()
+    row = np.dtype([("i", "<f8", 2), ("place", "<f4", 3), ("rest", "u1", 2)])
+    table = np.zeros(len(points), row)
+    table["place"] = points
+    return head.encode() + table.tobytes()
+
+
+@pytest.mark.parametrize("kind", ["spaces.xyz", "commas.xyz", "ascii.pcd", "binary.pcd"])
+def test_points_are_those_of_the_file(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    points = trimesh.sample.sample_surface(room(), 40_000, seed=1)[0]
+    if kind.endswith("pcd"):
+        Path(kind).write_bytes(pcd(points, kind.removesuffix(".pcd")))
+    else:
+        between = ", " if kind == "commas.xyz" else "  "
+        rows = (between.join(f"{each:.5f}" for each in (*point, 0.5)) for point in points)
+        Path(kind).write_text("# a comment\n\n" + "\n".join(rows) + "\n")
+    np.testing.assert_allclose(read_points(Path(kind), kind[-3:], len(points)), points, atol=1e-5)
+    if kind in ("spaces.xyz", "binary.pcd"):
+        assert main(["world", kind, "--out", "here"]) == 0
+        assert "40,000 points, 0.1 m thick" in capsys.readouterr().out
+        flown_inside("here")
+
+
+FEW = np.arange(15.0).reshape(5, 3)
+BAD_POINTS = {
+    "empty.xyz": (b"", "'empty.xyz' is empty; a world needs points"),
+    "words.xyz": (b"x y z\n1 2 3\n", "'words.xyz' is no list of points: each of its lines must begin with x y z"),
+    "two.xyz": (b"1 2\n3 4\n", "'two.xyz' is no list of points"),
+    "none.xyz": (b"# nothing\n", "'none.xyz' has 0 points; a world needs more"),
+    "nan.xyz": (b"0 0 0\n1 0 0\nnan 1 0\n1 1 2\n", "'nan.xyz' has a point that is not finite"),
+    "long.xyz": (b"1 " * 10_000, "'long.xyz' is no list of points"),
+    "many.xyz": (b"1 2 3\n" * 101, "'many.xyz' may have 100 points and has more than that, so thin it out"),
+    "lines.xyz": (b"\n" * 1000, "'lines.xyz' may have 100 points and has more than that"),
+    "millimetres.xyz": (b"0 0 0\n5000 0 0\n0 4000 0\n0 0 3000\n", "0.001 if it is in millimetres"),
+    "packed.pcd": (pcd(FEW, "binary_compressed"), "is compressed; write it as binary"),
+    "other.pcd": (pcd(FEW, "base64"), "has DATA base64; it must be ascii or binary"),
+    "text.pcd": (b"not a header\n" * 9, "'text.pcd' is no .pcd: a header from VERSION to DATA must come first"),
+    "flat.pcd": (pcd(FEW, "ascii", "x y w"), "'flat.pcd' must have the FIELDS x, y and z, each once"),
+    "sizes.pcd": (pcd(FEW, "ascii").replace(b"SIZE 8", b"SIZE 3"), "must have a SIZE, a TYPE (F, I or U) and a COUNT"),
+    "short.pcd": (pcd(FEW, "binary")[:-1], "'short.pcd' says that it has 5 points, and there are others or fewer"),
+    "fewer.pcd": (pcd(FEW, "ascii", count=6), "'fewer.pcd' says that it has 6 points, and there are others or fewer"),
+    "count.pcd": (pcd(FEW, "ascii").replace(b"POINTS 5", b"POINTS all"), "does not say how many POINTS it has"),
+    "many.pcd": (pcd(FEW, "binary", count=10**12), "'many.pcd' may have 100 points and has 1,000,000,000,000"),
+    "minus.pcd": (pcd(FEW, "binary", count=-1), "'minus.pcd' says that it has -1 points"),
+    "nan.pcd": (pcd(FEW * [1, np.nan, 1], "binary"), "'nan.pcd' has a point that is not finite"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_POINTS)
+def test_points_that_cannot_be_a_world_are_refused_in_a_sentence(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content, says = BAD_POINTS[name]
+    monkeypatch.setattr(scan, "MOST_READ", 100)
+    Path(name).write_bytes(content)
+    assert main(["world", name, "--out", "here"]) == 2
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1 and not Path("here").exists()
+
+
 def test_an_octomap_is_a_world(capsys: pytest.CaptureFixture[str]) -> None:
     x, y, z = np.indices((80, 50, 30))
     walls = (np.minimum(x, 79 - x) < 2) | (np.minimum(y, 49 - y) < 2) | (np.minimum(z, 29 - z) < 2)
@@ -114,7 +183,7 @@ def test_many_triangles_are_thinned_out(monkeypatch: pytest.MonkeyPatch) -> None
 
 BAD = {
     "none.ply": "there is no file 'none.ply'",
-    "room.fbx": "is no known scan; it must end in .ply, .stl, .obj, .glb, .bt",
+    "room.fbx": "is no known scan; it must end in .ply, .stl, .obj, .glb, .bt, .xyz, .pcd",
     "empty.bt": "'empty.bt' has 0 points; a world needs more",
     "small.ply": "measures 0.8 x 0.5 x 0.3 m, too little to fly in; give --scale",
     "large.ply": "m, more than 400; give a smaller --scale, 0.001 if it is in millimetres",

@@ -47,7 +47,7 @@ VOLUME_MARGIN = 5.0
 LONGEST_VOLUME = 500.0
 """Most metres along an axis of a flight volume; A*'s lattice must hold it."""
 
-SCANS = (".ply", ".stl", ".obj", ".glb", ".bt")
+SCANS = (".ply", ".stl", ".obj", ".glb", ".bt", ".xyz", ".pcd")
 """Endings of files of which `edqn world` makes worlds."""
 
 MAX_SHAPES = 500

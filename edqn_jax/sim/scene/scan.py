@@ -21,9 +21,10 @@ from edqn_jax.sim.scene.grid_boxes import clustered
 from edqn_jax.sim.scene.mesh_field import Grid, check_mesh, grid_of_mesh
 from edqn_jax.sim.scene.mjcf_parts.assets import load_geometry
 from edqn_jax.sim.scene.octomap import read_octomap
+from edqn_jax.sim.scene.point_files import POINT_KINDS, read_points
 from edqn_jax.sim.scene.shapes.kind import THICKNESS
 
-KINDS = ("ply", "stl", "obj", "glb", "bt")
+KINDS = ("ply", "stl", "obj", "glb", "bt", *POINT_KINDS)
 """Endings of scans."""
 
 MOST_READ = 5_000_000
@@ -97,6 +98,10 @@ def read_scan(file: Path, options: ScanOptions) -> Scan:
         vertices, side = read_octomap(file)
         faces, was, usual = None, f"{len(vertices):,} voxels", VOXEL_THICKNESS * side * options.scale
         _check_points(file, vertices)
+    elif kind in POINT_KINDS:
+        vertices = read_points(file, kind, MOST_READ)
+        faces, was = None, f"{len(vertices):,} points"
+        _check_vertices(file, vertices)
     else:
         vertices, faces, was = _content(file, load_geometry(file, kind, MOST_READ))
     up = options.up or ("y" if kind == "glb" else "z")
@@ -181,10 +186,15 @@ def _content(file: Path, found: Any) -> tuple[NDArray[np.float64], NDArray[np.in
     count, what = (len(faces), "triangles") if len(faces) else (len(vertices), "points")
     if count > MOST_READ:
         raise ConfigError(f"'{file}' has {count:,} {what}; it may have {MOST_READ:,}, so thin it out")
+    _check_vertices(file, vertices)
+    return vertices, faces if len(faces) else None, f"{count:,} {what}"
+
+
+def _check_vertices(file: Path, vertices: NDArray[np.float64]) -> None:
+    """Raises ConfigError if vertices [V, 3] are too few, or not finite."""
     _check_points(file, vertices)
     if not np.all(np.isfinite(vertices)):
         raise ConfigError(f"'{file}' has a point that is not finite; give it numbers")
-    return vertices, faces if len(faces) else None, f"{count:,} {what}"
 
 
 def _check_points(file: Path, points: NDArray[np.float64]) -> None:
