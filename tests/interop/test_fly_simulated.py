@@ -140,7 +140,7 @@ class Left:
 def test_a_flight_that_is_cut_off_says_why(tmp_path: Path, keeper: Any, said: str | None, outcome: str) -> None:
     nothing: Any = None
     flight = missions.Flight(nothing, np.zeros(3), 1.0)
-    flight.least_clearance = lambda: 1.0
+    flight.least_clearance = lambda since_s=0.0: 1.0
     stage = missions.Stage(nothing, nothing, 0.01, 20.0, nothing)
     why = missions._conduct(keeper, flight, stage)
     if said is not None:

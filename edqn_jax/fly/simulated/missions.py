@@ -251,8 +251,8 @@ def _conduct(keeper: Keeper, flight: Flight, stage: Stage) -> str:
                 break
             flight.fault_s = keeper.now
             stage.strike()
-        sees = position is not None and quaternion is not None and alone_s is None
-        if sees and frames * stage.frame_s <= keeper.next_wake():
+        is_due = alone_s is None and frames * stage.frame_s <= keeper.next_wake()
+        if position is not None and quaternion is not None and is_due:
             keeper.pass_time(frames * stage.frame_s)
             late_s = keeper.now - stage.strikes_at
             until, events = stage.camera.frame(keeper.now, position, quaternion, stage.wrong.light(late_s))
@@ -307,7 +307,7 @@ def _vehicle_words(
     place = [repr(float(each)) for each in start]
     words = ["-m", "edqn_jax.fly.simulated.vehicle", "--mavlink", f"udpout:127.0.0.1:{port}", "--start", *place]
     words += [f"--yaw={yaw!r}", "--seed", str(seed), "--clock", clock]
-    return [*words, "--fault", fault, "--fault-s", repr(fault_s)] if fault in OF_VEHICLE else words
+    return [*words, "--fault", str(fault), "--fault-s", repr(fault_s)] if fault in OF_VEHICLE else words
 
 
 def _autopilot_words(
