@@ -194,7 +194,7 @@ def _near_distances(
         # The box around a triangle reaches further than the triangle.
         is_near = _distances_to(table, owner, corner + side * place + middle) <= most
         owners.append(owner[is_near])
-        numbers.append(np.ravel_multi_index(tuple(place[is_near].T), tuple(blocks)))
+        numbers.append(np.asarray(np.ravel_multi_index(tuple(place[is_near].T), tuple(blocks)), np.int64))
     owner, block = np.concatenate(owners), np.concatenate(numbers)
     order = np.argsort(block, kind="stable")
     used, begin, number = np.unique(block[order], return_index=True, return_counts=True)
