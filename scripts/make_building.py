@@ -15,7 +15,7 @@ import trimesh
 from trimesh import Trimesh
 from trimesh.creation import box, cylinder, icosphere, torus
 
-from edqn_jax.sim.scene.scan import obj_text
+from edqn_jax.sim.scene.scans.scan import obj_text
 
 FILE = Path(__file__).parents[1] / "scenes/examples/building.obj"
 LENGTH, WIDTH, STOREY, THICK = 24.0, 14.0, 4.0, 0.2

@@ -68,7 +68,7 @@ def world_command(args: WorldArgs) -> None:
         ConfigError: if the scan cannot be a world, or the folder cannot be written.
     """
     from edqn_jax.config import Config
-    from edqn_jax.sim.scene.scan import NAME, ScanOptions, read_scan, world_of_scan
+    from edqn_jax.sim.scene.scans.scan import NAME, ScanOptions, read_scan, world_of_scan
 
     check_can_make(args.out)
     options = ScanOptions(args.scale, args.up, args.thickness, args.start, args.goal)

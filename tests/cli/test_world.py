@@ -9,9 +9,9 @@ import pytest
 import trimesh
 
 from edqn_jax.cli import main
-from edqn_jax.sim.scene import scan
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of
-from edqn_jax.sim.scene.point_files import read_points
+from edqn_jax.sim.scene.scans import scan
+from edqn_jax.sim.scene.scans.point_files import read_points
 from tests.support.octomaps import octomap_of
 
 ROOM = (8.0, 5.0, 3.0)

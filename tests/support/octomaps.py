@@ -1,4 +1,4 @@
-"""Writes OctoMap's binary maps, in other words than `sim/scene/octomap.py` reads them in."""
+"""Writes OctoMap's binary maps, in other words than `sim/scene/scans/octomap.py` reads them in."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.scene import octomap
-from edqn_jax.sim.scene.octomap import read_octomap
+from edqn_jax.sim.scene.scans import octomap
+from edqn_jax.sim.scene.scans.octomap import read_octomap
 from tests.support.octomaps import octomap_of
 
 VOXELS = np.concatenate(

@@ -20,8 +20,8 @@ from edqn_jax.sim.scene.free_ends import find_ends
 from edqn_jax.sim.scene.grid_boxes import clustered
 from edqn_jax.sim.scene.mesh_field import Grid, check_mesh, grid_of_mesh
 from edqn_jax.sim.scene.mjcf_parts.assets import load_geometry
-from edqn_jax.sim.scene.octomap import read_octomap
-from edqn_jax.sim.scene.point_files import POINT_KINDS, read_points
+from edqn_jax.sim.scene.scans.octomap import read_octomap
+from edqn_jax.sim.scene.scans.point_files import POINT_KINDS, read_points
 from edqn_jax.sim.scene.shapes.kind import THICKNESS
 
 KINDS = ("ply", "stl", "obj", "glb", "bt", *POINT_KINDS)
