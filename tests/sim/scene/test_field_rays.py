@@ -166,3 +166,25 @@ def test_the_least_of_blocks_is_never_more_than_a_value_in_them() -> None:
     for place in np.ndindex(*least.shape):
         block = values[tuple(slice(4 * i, 4 * i + 5) for i in place)]
         assert least[place] == block.min()
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_a_plate_of_a_millimetre_is_seen_from_the_front_and_aslant(
+    native: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A ray that only stopped some way within a surface would pass through it: the plate lies on points of its grid."""
+    plate = trimesh.creation.box(extents=[0.001, 3, 2])
+    stand = trimesh.creation.box(extents=[0.6, 0.3, 0.3]).apply_translation([0, 0, -1.2])
+    both = trimesh.util.concatenate([plate, stand])
+    geom = '<geom name="plate" type="mesh" mesh="plate" pos="8 5 3"/>'
+    file = mesh_world(tmp_path, geom, plate=(np.asarray(both.vertices), np.asarray(both.faces)))
+    if not native:
+        monkeypatch.setattr(field_rays, "is_available", lambda platform: False)
+    fields = load_scene(file).others["fields"]
+    assert not fields.grids[0].is_convex
+    for origin in ([4.0, 5.0, 3.2], [7.0, 2.0, 3.0], [7.3, 3.0, 3.1]):
+        aim = np.array([8.0, 5.0, 3.0]) + np.random.default_rng(0).uniform(-1, 1, (64, 3)) * [0, 1.3, 0.8]
+        rays = (aim - origin).astype(np.float32).reshape(8, 8, 3)
+        depth, hit, *_ = jax.jit(lambda o, r: meet(fields, o, r))(jnp.asarray(origin), jnp.asarray(rays))
+        assert np.all(hit)
+        np.testing.assert_allclose(np.asarray(depth), 1, atol=0.1)

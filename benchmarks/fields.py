@@ -1,0 +1,120 @@
+"""Is what is seen of a field right? Depth beside MuJoCo's, in a world from a file.
+
+Depth is that of pictures from free places in all directions; MuJoCo's is `mj_ray` through the same pixels of the file's
+own mesh. A pixel is at a silhouette where 1 / depth bends by more than 5 % beside it.
+
+    python benchmarks/fields.py scenes/examples/building.xml --pictures 100
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from edqn_jax.config import CameraConfig
+from edqn_jax.planning.lattice import clearances
+from edqn_jax.sim.camera import camera, raycast
+from edqn_jax.sim.scene.mjcf import compile_model, load_world, resolve_world
+from edqn_jax.sim.scene.scene import Scene
+from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
+
+CONFIG = CameraConfig(width=32, height=24)
+ROOM_M = 0.5
+"""Metres of clearance of the places from which pictures are taken."""
+SHARE = 0.05
+"""Of a depth, by which one of the same pixel may differ."""
+
+
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Returns the parsed arguments."""
+    parser = Parser("fields", __doc__)
+    parser.add_argument("world", nargs="?", default="scenes/examples/building.xml", help="an MJCF file")
+    parser.add_argument("--pictures", type=at_least_one, default=100, help="pictures of depth (default 100)")
+    parser.add_argument("--seed", type=int, default=0, help="of places and directions (default 0)")
+    return parser.parse(argv)
+
+
+def free_places(scene: Scene, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Returns places [count, 3], metres, with `ROOM_M` of clearance."""
+    low, high = np.asarray(scene.volume)
+    found = np.zeros((0, 3))
+    while len(found) < count:
+        tried = rng.uniform(low, high, (4 * count, 3))
+        found = np.concatenate([found, tried[clearances(scene, tried) > ROOM_M]])
+    return found[:count]
+
+
+def depth_in_mujoco(model: mujoco.MjModel, place: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Returns the distance [H, W], metres, along directions [H, W, 3] from a place [3]; inf where nothing is met."""
+    data, geom = mujoco.MjData(model), np.zeros(1, np.int32)
+    mujoco.mj_forward(model, data)
+    found = np.empty(directions.shape[:2])
+    for row, column in np.ndindex(found.shape):
+        way = directions[row, column] / np.linalg.norm(directions[row, column])
+        found[row, column] = mujoco.mj_ray(model, data, place, way, None, 1, -1, geom)
+    return np.where(found < 0, np.inf, found)
+
+
+def at_silhouettes(depth: np.ndarray) -> np.ndarray:
+    """Returns which pixels [M, H, W] have an edge beside them: on a plane closeness is linear in the picture."""
+    closeness = np.pad(1 / depth, ((0, 0), (1, 1), (1, 1)), mode="reflect", reflect_type="odd")
+    middle = closeness[:, 1:-1, 1:-1]
+    beside = (closeness[:, 1:-1, :-2], closeness[:, 1:-1, 2:]), (closeness[:, :-2, 1:-1], closeness[:, 2:, 1:-1])
+    return np.any([np.abs((one + other) / 2 - middle) > SHARE * middle for one, other in beside], axis=0)
+
+
+def compare_depth(world: str, count: int, seed: int) -> dict[str, Any]:
+    """Returns the shares of pixels of equal depth: of all, at silhouettes, and elsewhere."""
+    path, rng = resolve_world(world), np.random.default_rng(seed)
+    scene, model = load_world(path).scene, compile_model(path)
+    places = free_places(scene, count, rng)
+    turns = Rotation.from_rotvec(np.outer(rng.uniform(0, 2 * np.pi, count), [0, 0, 1])).as_matrix()
+    see = jax.jit(jax.vmap(lambda place, turn: camera.render_depth(CONFIG, scene, place, turn)))
+    ours = np.asarray(see(jnp.asarray(places, jnp.float32), jnp.asarray(turns, jnp.float32)))
+    theirs = []
+    for place, turn in zip(places, turns, strict=True):
+        rays = raycast.camera_rays(CONFIG, jnp.asarray(turn, jnp.float32))
+        parts = [np.broadcast_to(part, (CONFIG.height, CONFIG.width)) for part in (rays.dx, rays.dy, rays.dz)]
+        theirs.append(depth_in_mujoco(model, place, np.stack(parts, -1).astype(np.float64)))
+    theirs = np.stack(theirs)
+    same, edge = np.isclose(ours, theirs, rtol=SHARE, atol=0), at_silhouettes(theirs)
+    met = ~edge & np.isfinite(ours) & np.isfinite(theirs)
+    return {
+        "name": "depth",
+        "pictures": count,
+        "pixels": int(same.size),
+        "share": float(same.mean()),
+        "silhouettes": float(edge.mean()),
+        "share_at_silhouettes": float(same[edge].mean()),
+        "share_elsewhere": float(same[~edge].mean()),
+        "apart_m_median_elsewhere": float(np.median(np.abs(ours[met] - theirs[met]))),
+        "too_near": float(((ours < theirs) & ~same).mean()),
+        "too_far": float(((ours > theirs) & ~same).mean()),
+    }
+
+
+@in_a_sentence
+def main(argv: Sequence[str] | None = None) -> int:
+    """Returns exit code 0, or 2 for invalid input."""
+    args = parse(argv)
+    row = compare_depth(args.world, args.pictures, args.seed)
+    print(
+        f"{args.world}: depth is within {SHARE:.0%} of mj_ray in {row['share']:.1%} of {row['pixels']:,} pixels; "
+        f"{row['share_at_silhouettes']:.1%} of those at silhouettes ({row['silhouettes']:.0%} of all), "
+        f"{row['share_elsewhere']:.1%} elsewhere; too near {row['too_near']:.1%}, too far {row['too_far']:.1%}"
+    )
+    json_report.write(args.json, {"rows": [row]})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
