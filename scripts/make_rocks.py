@@ -46,7 +46,7 @@ def rocks() -> str:
     # One in each cell of 3 x 3, away from its sides.
     for i, (column, row) in enumerate(np.ndindex(3, 3)):
         place = 5.5 + 6.5 * column + rng.uniform(-1, 1), 2.8 + 5.2 * row + rng.uniform(-1, 1), rng.uniform(1.5, 4.5)
-        turn = Rotation.random(random_state=rng).as_quat()[[3, 0, 1, 2]]
+        turn = Rotation.random(None, rng).as_quat()[[3, 0, 1, 2]]
         grey = rng.uniform(0.3, 0.8)
         lines.append(
             f'    <geom name="rock {i}" type="mesh" mesh="rock{i % KINDS}" pos="{_text(place)}" '

@@ -175,7 +175,7 @@ def test_a_plate_of_a_millimetre_is_seen_from_the_front_and_aslant(
     """A ray that only stopped some way within a surface would pass through it: the plate lies on points of its grid."""
     plate = trimesh.creation.box(extents=[0.001, 3, 2])
     stand = trimesh.creation.box(extents=[0.6, 0.3, 0.3]).apply_translation([0, 0, -1.2])
-    both = trimesh.util.concatenate([plate, stand])
+    both: Any = trimesh.util.concatenate([plate, stand])
     geom = '<geom name="plate" type="mesh" mesh="plate" pos="8 5 3"/>'
     file = mesh_world(tmp_path, geom, plate=(np.asarray(both.vertices), np.asarray(both.faces)))
     if not native:
