@@ -241,8 +241,9 @@ def test_a_process_that_is_stopped_or_killed_leaves_a_vehicle_that_holds(
     _, said = flight.communicate(timeout=30)
     assert flight.returncode == code
     if number != signal.SIGKILL:
-        first, last = said.splitlines()
+        first, *between, last = said.splitlines()
         assert first == "edqn fly: starting, 0:00" and "the flight was stopped: process stopped" in last
+        assert all("flying" in line or "starting" in line for line in between)  # a line each two silent seconds
         assert read_records(tmp_path / "flight")[-1]["outcome"] == "process stopped"
 
 
