@@ -67,7 +67,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 def struck(fault: str, mission: Mission) -> bool:
     """Returns whether the fault came before the flight had ended."""
-    return mission.fault_s is not None or mission.outcome == fault  # a fence is left by an estimate first
+    # A fence may be left by the estimate alone, or earlier than by the true place.
+    return mission.fault_s is not None or (fault == Fault.FENCE and mission.outcome == fault)
 
 
 def ended_as_configured(fault: str, mission: Mission) -> bool:

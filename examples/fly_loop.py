@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from edqn_jax.fly.clocks import Clock, WallClock
-from edqn_jax.fly.faults import Command, Settings
+from edqn_jax.fly.faults import Command, Limits, Settings
 from edqn_jax.fly.link import Link
 from edqn_jax.fly.machine import Phase, State, step
 from edqn_jax.fly.streams import EventSource, open_events
@@ -110,5 +110,6 @@ if __name__ == "__main__":
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: asked.append(number))
     pilot = Runner(policy, camera=CAMERA, camera_fov_deg=FOV_DEG, contrast=CONTRAST)
-    task = Settings(np.array(goal, float), np.array(VOLUME), CAMERA, pilot.period_s)
+    limits = Limits(darkening=0.4 / CONTRAST)  # OFF events a pixel of a picture that goes dark
+    task = Settings(np.array(goal, float), np.array(VOLUME), CAMERA, pilot.period_s, limits=limits)
     print(fly(pilot, Link(vehicle), open_events(camera, CAMERA), WallClock(), task, VOLUME, lambda: bool(asked)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -46,7 +47,7 @@ class FlyArgs:
     simulate: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
     """Fly here, in a world by name or an MJCF file: three processes, RotorPy's quadrotor, an ESIM's events."""
     missions: Annotated[int, arg(metavar="N")] = 1
-    """With --simulate: how many."""
+    """With --simulate: how many; in a world of a file the same one again, with other errors of the vehicle."""
     jobs: Annotated[int, arg(metavar="J")] = 1
     """With --simulate: how many missions are flown at once, each on a core of its own."""
     seed: Annotated[int, arg(metavar="S")] = 0
@@ -54,7 +55,7 @@ class FlyArgs:
     speed: Annotated[float, arg(metavar="X")] = 1.0
     """With --simulate: most simulated seconds a second. Where the machine is slower, the clock waits for it."""
     fault: Annotated[str | None, arg(metavar="FAULT", help_behavior_hint="")] = None
-    """With --simulate: what goes wrong in each flight, by its name in docs/deployment.md, or "process killed"."""
+    """With --simulate: what goes wrong in each flight, such as "lost link", "low battery" or "process killed"."""
     fault_s: Annotated[tuple[float, float], arg(metavar="S S")] = (3.0, 8.0)
     """With --fault: between which simulated seconds, drawn for each mission."""
     picture: Literal["own", "mujoco"] = "own"
@@ -142,7 +143,7 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
         raise ConfigError("--fov and --calibration cannot both be given: a calibration says the field of view")
     if not 0.2 <= args.pace <= 1.0:
         raise ConfigError(f"--pace must be from 0.2 to 1, not {args.pace:g}")
-    if args.least_rate < 0 or args.unseen_s <= 0:
+    if not (args.least_rate >= 0 and args.unseen_s > 0):
         raise ConfigError("--least-rate must be at least 0 and --unseen-s more than 0")
     actions_of(args.on)
     if args.json is not None:
@@ -172,7 +173,7 @@ def check_fault(args: FlyArgs) -> None:
     """Raises ConfigError if there is no such fault to simulate, or it would strike at no time."""
     from edqn_jax.fly.simulated.injected import FAULTS
 
-    if not 0.0 <= args.fault_s[0] <= args.fault_s[1]:
+    if not 0.0 <= args.fault_s[0] <= args.fault_s[1] < math.inf:
         raise ConfigError("--fault-s must be two times of at least 0, the earlier one first")
     if args.fault is None:
         return
@@ -397,6 +398,7 @@ def simulate(args: FlyArgs) -> None:
 
         load_mujoco()
 
+    from edqn_jax.config import FAMILIES
     from edqn_jax.runs.policies import load_policy
     from edqn_jax.sim.environment import make
 
@@ -404,7 +406,7 @@ def simulate(args: FlyArgs) -> None:
     show_phase("reading policy and world")
     policy = load_policy(args.policy)
     # Before packages are missed that a flight needs: a world that there is none of is the first thing to say.
-    count = args.missions if args.jobs == 1 else 1
+    count = args.missions if args.jobs == 1 and args.simulate in FAMILIES else 1
     environment = make(args.simulate, policy.config, worlds=count, seed=args.seed, split="test")
 
     from edqn_jax.evaluation.metrics import wilson_interval
@@ -428,14 +430,19 @@ def simulate(args: FlyArgs) -> None:
         how = {"speed": args.speed, "picture": args.picture, "pace": args.pace}
         how |= {"fault": args.fault, "fault_s": args.fault_s}
         setup = Setup(file, size, **how, out=args.out, autopilot=more)
-        flown = fly_missions(environment, setup) if args.jobs == 1 else fly_at_once(*asked, setup, jobs=args.jobs)
+        flown = (
+            fly_missions(environment, args.missions, setup)
+            if args.jobs == 1
+            else fly_at_once(*asked, setup, jobs=args.jobs)
+        )
         show_phase("flying", 0, args.missions)
         for mission in flown:
             ended = sorted([*ended, mission], key=lambda each: each.number)
             show_phase("flying", len(ended), args.missions)
+            struck = "" if mission.fault_s is None else f"{args.fault} at {mission.fault_s:.1f} s; "
             print(
-                f"mission {mission.number}: {mission.outcome} after {mission.seconds:.1f} s, {mission.clearance_m:.2f} "
-                f"m clear at least; {mission.events_hz:,.0f} events/s; {mission.speed:.2f} simulated seconds a second; "
+                f"mission {mission.number}: {struck}{mission.outcome} after {mission.seconds:.1f} s, "
+                f"{mission.clearance_m:.2f} m clear at least; {mission.events_hz:,.0f} events/s; {mission.speed:.2f} simulated seconds a second; "
                 f"{latency_sentence(mission.latency)}",
                 flush=True,
             )

@@ -127,6 +127,8 @@ class Limits:
     """So long a lens that went dark, or has seen nothing yet, sees too little before it is called covered."""
     lit_s: float = 1.0
     """So long one that went dark must see enough again to count as open: the end of its going dark is no light."""
+    dark_stops: bool = True
+    """Whether a picture that goes dark is a fault by itself; not in logs from before it was."""
     unseen_s: float = 8.0
     """So long one that did not: blank walls, the ground and the sky show a good lens nothing for 6 s."""
     moving_m_s: float = 1.0
@@ -235,7 +237,7 @@ def faults_of(watched: Watch, inputs: Inputs, now: float, settings: Settings) ->
         Fault.NO_EVENTS: is_old(inputs.packet_at, now, limits.silent_s),
         Fault.BURST: inputs.rate_hz > limits.burst_hz,
         Fault.COVERED: is_old(watched.seen_at, now, limits.unseen_s if watched.is_open else limits.covered_s),
-        Fault.DARK: watched.is_dark,
+        Fault.DARK: limits.dark_stops and watched.is_dark,
     }
     yield from (fault for fault in Fault if found.get(fault))
 

@@ -210,6 +210,7 @@ def _hovering(state: State, inputs: Inputs, now: float, settings: Settings) -> t
     if lasting is not None and state.fault in PASSING and not state.outcome:
         state = dataclasses.replace(state, fault=lasting)
     passes = state.fault in PASSING and state.resumes < settings.resumes and not state.outcome
+    passes = passes and not state.watched.is_dark
     if not passes or found:
         return dataclasses.replace(state, clear_at=None), Output(STILL)
     clear = now if state.clear_at is None else state.clear_at

@@ -12,7 +12,7 @@ import pytest
 
 from edqn_jax.cli import fly as command
 from edqn_jax.errors import ConfigError
-from edqn_jax.fly.faults import Fault, Inputs
+from edqn_jax.fly.faults import Fault, Inputs, Watch, faults_of, watch
 from edqn_jax.fly.machine import Phase
 from edqn_jax.fly.pilot import LATE_S, PATIENCE_S, TICK_S
 from edqn_jax.fly.records import EVENTS, RECORDS, FlightLog, inputs_of, read_records, settings_of
@@ -61,9 +61,14 @@ def test_a_log_from_before_lenses_were_told_apart_keeps_its_rule(tmp_path: Path)
     log.close()
     record = next(each for each in read_records(tmp_path / "flight") if each["kind"] == "settings")["settings"]
     assert settings_of(record).limits == SETTINGS.limits
-    for new in ("unseen_s", "darkening", "lit_s"):
+    for new in ("unseen_s", "darkening", "lit_s", "dark_stops"):
         del record["limits"][new]
-    assert settings_of(record).limits.unseen_s == SETTINGS.limits.covered_s
+    old = settings_of(record)
+    assert old.limits.unseen_s == SETTINGS.limits.covered_s
+    dark, now = Inputs(camera=SETTINGS.camera, darkening=9.0, rate_hz=1e6), 1.0
+    for settings, stops in ((SETTINGS, True), (old, False)):
+        watched = watch(Watch(), dark, now, settings.limits)
+        assert watched.is_dark and (Fault.DARK in faults_of(watched, dark, now, settings)) is stops
 
 
 class Packets(Camera):

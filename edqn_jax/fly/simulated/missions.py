@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.config import Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.evaluation.judge import MujocoWorld, clearance, load_judge, replay_contact
 from edqn_jax.fly.faults import Fault, is_inside
 from edqn_jax.fly.link import MODES, PX4
@@ -172,30 +172,31 @@ class Stage:
         )
 
 
-def fly_missions(environment: Environment, setup: Setup) -> Iterator[Mission]:
-    """Yields how each mission of an environment ended."""
-    for number in range(environment.missions):
+def fly_missions(environment: Environment, missions: int, setup: Setup) -> Iterator[Mission]:
+    """Yields how each of so many missions of an environment ended."""
+    for number in range(missions):
         yield fly_mission(environment, number, setup)
 
 
 def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
-    """Flies one mission and returns how it ended.
+    """Flies one mission and returns how it ended; where a world has fewer, the same ones again, with other errors.
 
     Raises:
         ConfigError: if a process does not start.
         MissingPackageError: if a package of the extra `transfer` is not installed.
     """
-    config, scene = environment.config, environment.scene(number)
+    config, place = environment.config, number % environment.missions
+    scene = environment.scene(place)
     start, goal = np.asarray(scene.start, np.float64), np.asarray(scene.goal, np.float64)
     flight = Flight(
-        load_judge(pictures.spec_of(environment, number, "plain", 0), config.drone.body_radius_m),
+        load_judge(pictures.spec_of(environment, place, "plain", 0), config.drone.body_radius_m),
         goal,
         config.env.goal_radius_m,
     )
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         out = folder if setup.out is None else setup.out / f"mission-{number}"
-        see = _see(environment, number, setup, stack)
+        see = _see(environment, place, setup, stack)
         camera = EventCamera(see, lambda attitude: camera_rotation(attitude, config.camera.mount))
         server = EventServer(setup.size)
         stack.callback(server.close)
@@ -353,9 +354,9 @@ def _wait(process: subprocess.Popen) -> None:
 
 
 def environment_of(world: str, config: Config, missions: int, seed: int) -> Environment:
-    """Returns the missions to fly: test worlds of a family, the first of which `edqn evaluate` flies, or one of a file.
+    """Returns the missions to fly: test worlds of a family, which `edqn evaluate` flies first, or that of a file.
 
     Raises:
         ConfigError: as `make`.
     """
-    return make(world, config, worlds=missions, seed=seed, split="test")
+    return make(world, config, worlds=missions if world in FAMILIES else 1, seed=seed, split="test")
