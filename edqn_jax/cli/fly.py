@@ -442,7 +442,8 @@ def simulate(args: FlyArgs) -> None:
             struck = "" if mission.fault_s is None else f"{args.fault} at {mission.fault_s:.1f} s; "
             print(
                 f"mission {mission.number}: {struck}{mission.outcome} after {mission.seconds:.1f} s, "
-                f"{mission.clearance_m:.2f} m clear at least; {mission.events_hz:,.0f} events/s; {mission.speed:.2f} simulated seconds a second; "
+                f"{mission.clearance_m:.2f} m clear at least; {mission.events_hz:,.0f} events/s; "
+                f"{mission.speed:.2f} simulated seconds a second; "
                 f"{latency_sentence(mission.latency)}",
                 flush=True,
             )
