@@ -344,19 +344,21 @@ def settings_of(args: FlyArgs, size: tuple[int, int], period_s: float) -> Settin
             at_goal=Action(args.at_goal),
             flight_s=args.max_s,
             limits=Limits(
-                covered_hz=args.least_rate, unseen_s=args.unseen_s / args.pace, **darkening_of(args.contrast)
+                covered_hz=args.least_rate,
+                unseen_s=args.unseen_s / args.pace,
+                darkening=darkening_of(args.contrast, Limits.darkening),
             ),
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
 
 
-def darkening_of(contrast: float | None) -> dict[str, float]:
-    """Returns by how many OFF events a pixel a camera of this contrast sees its picture go dark; {} if it is not told.
+def darkening_of(contrast: float | None, untold: float) -> float:
+    """Returns by how many OFF events a pixel a camera of this contrast sees its picture go dark; `untold` without one.
 
     As much less light makes more events of a smaller contrast.
     """
-    return {} if contrast is None else {"darkening": DARKENING / contrast}
+    return untold if contrast is None else DARKENING / contrast
 
 
 def replay(args: FlyArgs, folder: Path) -> None:

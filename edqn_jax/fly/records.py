@@ -100,7 +100,8 @@ def settings_of(record: dict[str, Any]) -> Settings:
     fields["after_hover"], fields["at_goal"] = Action(fields["after_hover"]), Action(fields["at_goal"])
     limits = fields["limits"]
     # Where a log is older than `unseen_s`, every lens that saw too little for `covered_s` was covered.
-    fields["limits"] = Limits(**{"unseen_s": limits["covered_s"], "dark_stops": False} | limits)
+    before: dict[str, Any] = {"unseen_s": limits["covered_s"], "dark_stops": False}  # where a log does not say it
+    fields["limits"] = Limits(**before | limits)
     return Settings(**fields)
 
 

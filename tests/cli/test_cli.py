@@ -350,8 +350,9 @@ def test_a_simulated_flights_world_is_looked_at_before_its_packages(monkeypatch)
 
 
 def test_a_camera_of_a_smaller_contrast_sees_more_events_as_its_lens_is_covered():
-    assert darkening_of(0.2) == {"darkening": Limits.darkening} and darkening_of(0.1) == {"darkening": 4.0}
-    assert darkening_of(None) == {}
+    assert (
+        darkening_of(0.2, 7.0) == Limits.darkening and darkening_of(0.1, 7.0) == 4.0 and darkening_of(None, 7.0) == 7.0
+    )
 
 
 def test_help_all_lists_every_option_and_does_not_start_jax():
