@@ -88,7 +88,8 @@ def shown_in_a_pipe(*argv: str) -> subprocess.CompletedProcess[str]:
 
 def test_a_pipe_sees_the_first_line_at_once_and_its_output_is_the_commands_own() -> None:
     ended = shown_in_a_pipe("--import", "own.py", "evaluate", "pretrained")
-    assert re.fullmatch(r"edqn evaluate: starting, 0:0\d\n", ended.stderr) and ended.stdout == "light\ndone\n"
+    # On a machine that is slower than two seconds, lines follow.
+    assert re.fullmatch(r"edqn evaluate: starting, 0:0\d\n( .*\n)*", ended.stderr) and ended.stdout == "light\ndone\n"
 
 
 @pytest.mark.parametrize(
