@@ -112,7 +112,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"{row['share_at_silhouettes']:.1%} of those at silhouettes ({row['silhouettes']:.0%} of all), "
         f"{row['share_elsewhere']:.1%} elsewhere; too near {row['too_near']:.1%}, too far {row['too_far']:.1%}"
     )
-    json_report.write(args.json, {"rows": [row]})
+    about = {"world": args.world, "seed": args.seed}
+    json_report.write(args.json, {**json_report.machine(jax.devices()), **about, "rows": [row]})
     return 0
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ import faults  # noqa: E402
 from edqn_jax.fly.faults import Fault, Limits  # noqa: E402
 from edqn_jax.fly.simulated import injected  # noqa: E402
 from edqn_jax.fly.simulated.injected import CameraFault, fence_of, moment_of  # noqa: E402
-from edqn_jax.fly.simulated.missions import Mission  # noqa: E402
+from edqn_jax.fly.simulated.missions import Mission, Setup, Stage  # noqa: E402
 from edqn_jax.fly.streams import EVENT  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx, rotorpy and what they import
@@ -76,6 +78,31 @@ def test_how_a_flight_must_end() -> None:
         assert faults.ended_as_configured(fault, mission(str(outcome), mode))
         assert not faults.ended_as_configured(fault, mission(str(outcome), "offboard"))
         assert not faults.ended_as_configured(fault, mission("goal", mode))
+
+
+def test_what_counts_as_struck_and_when_its_twin_is_stopped() -> None:
+    def mission(outcome: str, fault_s: float | None) -> Mission:
+        return Mission(0, outcome, 1.0, 1.0, {}, 0.0, 1.0, fault_s=fault_s)
+
+    assert faults.struck(Fault.BURST, mission("collision", 3.0)) and faults.struck(
+        Fault.FENCE, mission("collision", 3.0)
+    )
+    # An alarm before the fault is none of it; a fence may be left by the estimate alone.
+    assert not faults.struck(Fault.BURST, mission(Fault.BURST, None)) and not faults.struck(
+        Fault.FENCE, mission("goal", None)
+    )
+    assert faults.struck(Fault.FENCE, mission(Fault.FENCE, None))
+    twin = faults.stopped_at(Setup(Path("a.onnx"), fault=Fault.FENCE), 4.5)
+    assert twin.fault == Fault.TAKEN_OVER and moment_of(twin.fault_s, 7) == 4.5
+
+
+def test_a_fault_comes_at_its_time_or_as_the_fence_is_left() -> None:
+    nothing: Any = None
+    inside, outside = np.array([1.0, 1.0, 1.0]), np.array([1.0, 3.0, 1.0])
+    timed = Stage(nothing, nothing, FRAME_S, 60.0, nothing, strikes_at=4.0)
+    assert not timed.comes(3.9, outside) and timed.comes(4.0, None)
+    fenced = dataclasses.replace(timed, strikes_at=np.inf, fence=np.array([[0.0, 0.0, 0.0], [2.0, 2.0, 2.0]]))
+    assert not fenced.comes(9.0, None) and not fenced.comes(9.0, inside) and fenced.comes(0.1, outside)
 
 
 @pytest.mark.slow
