@@ -55,7 +55,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         "run", nargs="?", type=Path, default=Path("pretrained-looks"), help="folder of a run, or a name"
     )
     parser.add_argument("--world", default="rooms", help="random worlds by name, or an MJCF file (default rooms)")
-    parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=FAULTS, help="(default all)")
+    which = f"of {', '.join(FAULTS)} (default all)"
+    parser.add_argument("--faults", nargs="+", default=list(FAULTS), choices=FAULTS, metavar="FAULT", help=which)
     parser.add_argument("--missions", type=at_least_one, default=20, help="with each fault (default 20)")
     parser.add_argument("--jobs", type=at_least_one, default=1, help="flown at once (default 1)")
     parser.add_argument(
