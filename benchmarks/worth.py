@@ -6,7 +6,9 @@ memory, and two controls: `blind`, which sees nothing, and `depth`, the truth. T
 
     looks   events, one frame, frame pair and the difference of the pair, trained with one look and with drawn ones,
             flown in looks that were never trained on
-    age     decisions at 25 Hz among balls that are thrown late; true depth as it is, and one and two observations old
+    age     decisions at 25 Hz among balls that are thrown late; true depth as it is, and one and two observations old;
+            events, frames at the decision, and pairs of cameras of 30 to 200 frames a second (frame-pair@30) that are
+            there 15 ms later
     dark    light from 0.1 to 10,000 lux, sensors with the faults of real ones
     turning the camera on the body, 64 x 48 pixels, at 8 and 12 m/s among trunks, in 50 to 500 lux
     bytes   nothing is trained: the events of flights against frames, in bytes a second

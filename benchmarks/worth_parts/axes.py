@@ -27,6 +27,13 @@ REAL = {BLIND: (), DEPTH: (), "events": REAL_EVENTS, "frames": REAL_FRAMES, "fra
 
 LUX = (0.1, 1.0, 10.0, 100.0, 10_000.0)
 
+AGES = (BLIND, DEPTH, "depth-late-1", "depth-late-2", "events", *FRAMES[:2])
+CLOCK = "@"
+"""Before the frames a second of a camera that has a clock, in a sensor's name; others take theirs at the decision."""
+RATES_HZ = (30, 60, 120, 200)
+LATENCY_S = 0.015
+"""From the end of an exposure until a clocked frame is there: readout and transfer take 10 to 20 ms."""
+
 QUICK = (
     *("--drone.physics-steps", "2", "--env.max-decisions", "400", "--events.frame-times-s", "-0.04", "0"),
     *("--agent.discount", "0.99", "--agent.n-step", "8", "--agent.history", "3", "--env.step-reward", "-0.03"),
@@ -48,7 +55,7 @@ class Axis:
     trained: Mapping[str, Sequence[str]]
     """By condition: options of training in it."""
     sensors: Mapping[str, Sequence[str]]
-    """By `env.sensor`: options that the sensor has."""
+    """By `env.sensor`, with the rate of a camera with a clock behind it: options that the sensor has."""
     flown: Mapping[str, Layer]
     """By condition: what is otherwise than in training. A comma parts it into column and row of the figure."""
     flags: Sequence[str] = ()
@@ -82,7 +89,11 @@ AXES: dict[str, Axis] = {
         "Age of what is seen, and time to impact",
         ("court",),
         {"0.3 to 1 s": ()},
-        dict.fromkeys((BLIND, DEPTH, "depth-late-1", "depth-late-2", "events", "frame-pair", "frames"), ()),
+        dict.fromkeys(AGES, ())
+        | {
+            f"frame-pair{CLOCK}{rate}": ("--exposure.rate-hz", str(rate), "--exposure.latency-s", str(LATENCY_S))
+            for rate in RATES_HZ
+        },
         {
             f"{least:g} to {most:g} s, {speed:g} m/s": {
                 "world": {"ball_seconds": (least, most), "ball_speed_m_s": speed, "ball_slowest": 1.0}
@@ -138,6 +149,11 @@ def places_of(axis: Axis, worlds: Sequence[str], trained: Sequence[str], sensors
     ]
 
 
+def camera_of(sensor: str) -> str:
+    """Returns the `env.sensor` of a sensor of an axis, whose name may have a clock behind it."""
+    return sensor.partition(CLOCK)[0]
+
+
 def is_first_alone(axis: Axis, sensor: str) -> bool:
     """Returns whether a sensor is trained in the first condition alone, and stands for all of them."""
     return axis.same_trained and sensor in (BLIND, DEPTH)
@@ -159,4 +175,4 @@ def config_of(axis: Axis, place: Place, flags: Sequence[str]) -> Config:
         ConfigError: if the options are invalid.
     """
     own = (*axis.flags, *axis.trained[place.trained], *axis.sensors[place.sensor])
-    return success.config_of(place.world, place.sensor, [*own, *flags])
+    return success.config_of(place.world, camera_of(place.sensor), [*own, *flags])

@@ -14,7 +14,7 @@ import success
 from edqn_jax.errors import ConfigError
 from edqn_jax.report.style import INK, MUTED, open_figure
 from worth_parts import traffic
-from worth_parts.axes import AXES, BLIND, DEPTH
+from worth_parts.axes import AXES, BLIND, CLOCK, DEPTH, RATES_HZ
 from worth_parts.table import Cell, best_of, rows_of, verdict_of
 
 COLOURS = {
@@ -23,6 +23,7 @@ COLOURS = {
     "frame-pair": "#3f7fbf",
     "frame-difference": "#7f6fc4",
     "frames or pairs": "#9cc3e0",
+    **{f"frame-pair{CLOCK}{rate}": "#3f7fbf" for rate in RATES_HZ},
     "depth": "#009e73",
     "depth-late-1": "#a6d9c7",
     "depth-late-2": "#d3ece4",
@@ -37,6 +38,7 @@ LABELS = {
     "frame-pair": "frame pair leads",
     "frame-difference": "difference of the pair leads",
     "frames or pairs": "frames or pairs, events behind",
+    **{f"frame-pair{CLOCK}{rate}": f"frame pair at {rate} a second leads" for rate in RATES_HZ},
     "depth": "fresh depth ahead of older",
     "depth-late-1": "depth one observation old leads",
     "depth-late-2": "depth two observations old leads",
@@ -45,6 +47,7 @@ LABELS = {
 
 SHORT = {
     **{"frames": "frame", "frame-pair": "pair", "frame-difference": "diff.", BLIND: "blind"},
+    **{f"frame-pair{CLOCK}{rate}": f"{rate} Hz" for rate in RATES_HZ},
     **{DEPTH: "fresh", "depth-late-1": "1 late", "depth-late-2": "2 late"},
 }
 

@@ -14,7 +14,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import bootstrap_rates, percentile_interval, rate_interval
 from measurement.intervals import difference_interval
 from worth_parts import traffic
-from worth_parts.axes import AXES, BLIND, DEPTH, FRAMES, Axis, flown_of, is_first_alone
+from worth_parts.axes import AXES, BLIND, DEPTH, FRAMES, Axis, camera_of, flown_of, is_first_alone
 
 GOAL = "1"
 """Digit of a flight that arrived."""
@@ -107,9 +107,13 @@ def verdict_of(best: Sequence[str], rivals: Sequence[str]) -> str:
         return "–"
     if len(best) == 1:
         return best[0]
-    if set(best) <= set(FRAMES) and not set(rivals) <= set(FRAMES):
+    if _are_frames(best) and not _are_frames(rivals):
         return "frames or pairs"
     return "no difference"
+
+
+def _are_frames(sensors: Iterable[str]) -> bool:
+    return all(camera_of(sensor) in FRAMES for sensor in sensors)
 
 
 def all_cells(rows: Sequence[success.Row]) -> dict[str, list[Cell]]:
@@ -168,7 +172,7 @@ def _rate(cell: Cell, sensor: str) -> str:
 
 def _ahead(cell: Cell) -> str:
     """Returns by how many points events are ahead of the best sensor of frames, with the interval."""
-    frames = [sensor for sensor in cell.arrived if sensor in FRAMES]
+    frames = [sensor for sensor in cell.arrived if camera_of(sensor) in FRAMES]
     if not frames or "events" not in cell.arrived:
         return "–"
     best = max(frames, key=lambda sensor: cell.arrived[sensor].mean())

@@ -90,6 +90,14 @@ def test_late_balls_come_at_25_decisions_a_second() -> None:
     assert config.world.ball_seconds == (0.3, 1.0) and config.world.ball_radii_m == (0.15, 0.3)
 
 
+def test_a_camera_with_a_clock_has_its_rate_and_latency_and_counts_as_frames() -> None:
+    config = config_of(AXES["age"], Place("court", "0.3 to 1 s", "frame-pair@60"), SMALL)
+    assert (config.env.sensor, config.exposure.rate_hz, config.exposure.latency_s) == ("frame-pair", 60, 0.015)
+    assert table.verdict_of(["frame-pair@60", "frame-pair@30"], ["events", "frame-pair@30", "frame-pair@60"]) == (
+        "frames or pairs"
+    )
+
+
 def test_what_an_axis_has_not_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     for words, said in (
         (["--axis", "looks", "--sensors", "ranges"], "--sensors must be of what the axis has (blind, depth, events,"),
