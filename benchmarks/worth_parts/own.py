@@ -13,6 +13,7 @@ from edqn_jax.config import Config
 from edqn_jax.config.registry import FAMILIES, SENSORS
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.sensors.built_in import CHANGE_SCALE
 from edqn_jax.sim.sensors.sensor import Image, last_view, nearness_image
 from edqn_jax.sim.worlds import building
 from edqn_jax.sim.worlds.free_points import TRIES
@@ -27,17 +28,20 @@ COURT_M = (40.0, 40.0, 16.0)
 def difference() -> edqn_jax.Sensor:
     """Returns the sensor `frame-difference`: of a frame pair, how much darker each frame before the newest was.
 
-    The newest frame itself is not shown.
+    The newest frame itself is not shown. What grew brighter and what grew darker are pictures of their own, as
+    `log1p` of thresholds: the VAE sees counts of events so, and all that differs from these is their rounding.
     """
     pair = SENSORS.get("frame-pair")
 
     def show(config: Config, scene: Scene, poses: Flight, memory: Any, key: Array) -> tuple[Array, Any]:
         pictures, memory = pair.show(config, scene, poses, memory, key)
-        return pictures[1:], memory
+        thresholds = pictures[1:] * (CHANGE_SCALE / config.events.threshold)
+        both = jnp.concatenate([jnp.maximum(thresholds, 0.0), jnp.maximum(-thresholds, 0.0)])
+        return jnp.log1p(both), memory
 
     def shape(config: Config) -> tuple[int, ...]:
         count, *size = pair.shape(config)
-        return count - 1, *size
+        return 2 * (count - 1), *size
 
     return edqn_jax.Sensor(
         show,
@@ -46,7 +50,7 @@ def difference() -> edqn_jax.Sensor:
         draws_frames=True,
         exposes=True,
         at_rest=pair.at_rest,
-        image=Image("change of log brightness", "change of log brightness", signed=True),
+        image=Image("what grew brighter", "log1p of contrast thresholds"),
     )
 
 

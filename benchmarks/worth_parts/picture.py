@@ -54,6 +54,12 @@ SHORT = {
 CONTRASTS = (0.05, 0.2)
 """Of the sensors whose bytes are drawn; tables have others, and more resolutions than the smallest and the largest."""
 
+MOST_NAMED = 3
+"""Sensors that are named in a cell; more are counted."""
+
+FEWEST_COLUMNS = 6
+"""For which a panel has room, so that its title has."""
+
 ROW_IN, LABEL_IN, CELL_IN, HEAD_IN = 0.42, 2.1, 1.02, 0.62
 """Height of a row, width of row labels, width of a column, and height over a panel, inches."""
 
@@ -86,7 +92,7 @@ def draw_map(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]], f
     if not panels:
         raise ConfigError(f"there are no rows of this benchmark beside '{file}'; measure some with --axis first")
     heights = [HEAD_IN + ROW_IN * len(panel.rows) for panel in panels]
-    width = LABEL_IN + CELL_IN * max(len(panel.columns) for panel in panels) + 0.2
+    width = LABEL_IN + CELL_IN * max(FEWEST_COLUMNS, *(len(panel.columns) for panel in panels)) + 0.2
     shown = {who for panel in panels for who, _ in panel.cells.values()}
     foot = 0.3 + 0.2 * -(-len(shown) // 3)
     height = sum(heights) + foot
@@ -120,8 +126,12 @@ def _written(cell: Cell, best: Sequence[str]) -> str:
     """Returns success as blind → best → depth, and by how much the best of the events' camera is ahead or behind."""
     named = [sensor for sensor in (BLIND, *best[:1], DEPTH) if sensor in cell.arrived]
     rates = " → ".join(f"{100 * cell.arrived[sensor].mean():.0f}" for sensor in dict.fromkeys(named))
-    tied = ", ".join(SHORT.get(sensor, sensor) for sensor in best[:3])
+    tied = f"{len(best)} of {len(cell.rivals)} alike" if len(best) > MOST_NAMED else _named(best)
     return f"{rates}\n{tied}"
+
+
+def _named(sensors: Sequence[str]) -> str:
+    return ", ".join(SHORT.get(sensor, sensor) for sensor in sensors)
 
 
 def _bytes_panel(rows: Sequence[success.Row]) -> Panel:

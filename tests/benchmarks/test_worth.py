@@ -20,6 +20,7 @@ from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import take_scene
+from edqn_jax.sim.sensors.built_in import CHANGE_SCALE
 from edqn_jax.sim.sensors.sensor import nearness_image
 from edqn_jax.sim.task.env import scene_of
 from edqn_jax.sim.task.flights import Record
@@ -187,6 +188,23 @@ def test_depth_that_is_late_shows_the_picture_of_an_observation_before() -> None
     for picture, expected in zip(shown, (true[0], true[0], true[0], true[1]), strict=True):
         np.testing.assert_allclose(picture, expected, atol=1e-5)
     assert np.abs(np.asarray(true[1] - true[0])).max() > 0.01
+
+
+def test_the_difference_of_a_pair_counts_thresholds_as_events_do_and_hides_the_newest_frame() -> None:
+    scene = load_missions(CONFIG, "medium", 1).scene()
+    moved = scene.start + jnp.array([[0.0, 0.0, 0.0], [0.6, 0.2, 0.1]])
+    poses = Flight(position=moved, quaternion=jnp.array([[1.0, 0.0, 0.0, 0.0]] * 2), velocity=jnp.zeros((2, 3)))
+    shown = {}
+    for name in ("frame-pair", "frame-difference"):
+        config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor=name))
+        sensor = SENSORS.get(name)
+        shown[name] = np.asarray(
+            sensor.show(config, scene, poses, sensor.at_rest(config, jax.random.key(0)), jax.random.key(1))[0]
+        )
+        assert shown[name].shape == sensor.shape(config)
+    brighter, darker = np.expm1(shown["frame-difference"]) * CONFIG.events.threshold
+    np.testing.assert_allclose(brighter - darker, CHANGE_SCALE * shown["frame-pair"][1], atol=1e-5)
+    assert (brighter > 0.01).any() and (darker > 0.01).any() and not (brighter * darker).any()
 
 
 # ------------------------------------------------------------------------------------------ report
