@@ -20,6 +20,16 @@ whole_files = threading.Lock()
 """Lock held during atomic writes."""
 
 
+def cache_folder() -> Path:
+    """Returns the folder of what is kept from one command to the next: `$XDG_CACHE_HOME/edqn_jax`, or in `~/.cache`.
+
+    Raises:
+        RuntimeError: if there is no home.
+    """
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(given) if os.path.isabs(given) else Path.home() / ".cache") / "edqn_jax"
+
+
 def write_atomically(file: Path, content: str | bytes) -> None:
     """Writes a file atomically, text as UTF-8: after an interruption the old or the new content is there, never a part.
 

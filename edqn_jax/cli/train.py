@@ -20,7 +20,7 @@ from edqn_jax.cli.arguments import check_flags, flags_of_group
 from edqn_jax.cli.help import TRAIN, asks_for_help, flag_of, show_train_help
 from edqn_jax.cli.process.parsing import parse_or_say
 from edqn_jax.cli.process.signals import Stops
-from edqn_jax.cli.process.status import BEGAN, end_status, show_phase
+from edqn_jax.cli.process.status import BEGAN, end_status, last_time, show_phase
 from edqn_jax.cli.process.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import apply_layer, load_layer, resolve_config, to_yaml
@@ -270,8 +270,13 @@ def _open_progress(writes: bool) -> Progress:
     from edqn_jax.training.progress import Progress, has_panel
 
     console = Console(quiet=not writes)
-    tell = (lambda *_: end_status()) if has_panel(console) else show_phase
-    return Progress(console, tell=tell, began=BEGAN)
+
+    def tell(name: str, done: int = 0, total: int = 0) -> None:
+        if has_panel(console):
+            end_status()
+        show_phase(name, done, total)
+
+    return Progress(console, tell=tell, began=BEGAN, last_time=last_time)
 
 
 def _warnings(config: Config, start: Policy | None) -> tuple[str, ...]:

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 
 from edqn_jax.devices.hardware import count_cores
+from edqn_jax.files import cache_folder
 
 MAX_BYTES = 2**30
 """Of kept programs; beyond this the older ones are deleted."""
@@ -61,9 +62,7 @@ def private_folder() -> Path | None:
 
 def _folder() -> Path:
     """Returns where programs are kept: those of one processor may not run on another."""
-    given = os.environ.get("XDG_CACHE_HOME", "")
-    root = Path(given) if os.path.isabs(given) else Path.home() / ".cache"
-    return root / "edqn_jax" / f"programs-{hashlib.sha256(_cpu_fingerprint().encode()).hexdigest()[:12]}"
+    return cache_folder() / f"programs-{hashlib.sha256(_cpu_fingerprint().encode()).hexdigest()[:12]}"
 
 
 def _cpu_fingerprint() -> str:

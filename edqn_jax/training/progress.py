@@ -97,13 +97,14 @@ class Progress:
         every_s: float = 2.0,
         tell: ShowPhase = show_nothing,
         began: float | None = None,
+        last_time: Callable[[str], float | None] = lambda phase: None,
     ) -> None:
         """Writes to `console`, or standard output; without terminal or notebook, a line for each phase and `every_s`.
 
         `tell` is called with the name of each phase, and with how much of it is done. The clock runs from `began` on,
-        seconds of `time.monotonic`, or from now on.
+        seconds of `time.monotonic`, or from now on. `last_time` returns the seconds that a phase took the last time.
         """
-        self._tell = tell
+        self._tell, self._last_time = tell, last_time
         self._console = console or Console()
         self._every_s = every_s
         self._live: Live | CellPanel | None = None
@@ -230,7 +231,9 @@ class Progress:
         done, count = self._counted
         counted = f", {done:,} of {count:,}," if count > 1 else ""
         clock = format_duration(time.monotonic() - self._phase_started)
-        phase = Text(f"{self._phase}{counted} {clock}", style="bold")
+        last = None if self._total else self._last_time(self._phase)
+        before = "" if last is None else f", last time {format_duration(last)}"
+        phase = Text(f"{self._phase}{counted} {clock}{before}", style="bold")
         total = f"{format_duration(self.elapsed_s)} in all"
         if self._total:
             bar = ProgressBar(total=self._total, completed=self._decisions())

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 
+from edqn_jax.cli.process.durations import Durations
 from edqn_jax.cli.process.streams import Lasting
 
 BEGAN = time.monotonic()
@@ -36,14 +37,16 @@ _CLEARED = b"\r\x1b[K"
 class Status:
     """The phase of a command and its clock."""
 
-    def __init__(self, title: str, descriptor: int, *, lives: bool) -> None:
+    def __init__(self, title: str, descriptor: int, *, lives: bool, durations: Durations | None = None) -> None:
         """Shows nothing before `start`.
 
         Args:
             title: what each line begins with.
             descriptor: to write to.
             lives: whether one line is drawn over and over, as a terminal can.
+            durations: of the last time.
         """
+        self._durations = durations
         self._title, self._descriptor, self._lives = title, descriptor, lives
         self._lock, self._ended = threading.RLock(), threading.Event()
         self._began = self._phase_began = self._printed = time.monotonic()
@@ -86,9 +89,14 @@ class Status:
         parts.append(_clock(took))
         if 0 < self._done < self._total and self._name not in UNEVEN:
             parts.append(f"about {_clock(took / self._done * (self._total - self._done))} left")
+        elif not self._total and not is_short and (last := self._last()):
+            parts.append(f"last time {_clock(last)}")
         if not is_short and now - self._began > took + 1.0:
             parts.append(f"{_clock(now - self._began)} in all")
         return ", ".join(parts)
+
+    def _last(self) -> float | None:
+        return None if self._durations is None else self._durations.last(self._name)
 
     def _tick(self) -> None:
         while not self._ended.wait(TICK_S):
@@ -121,9 +129,14 @@ class Status:
 _shown: list[Status] = []
 """The status of this process' command, if it shows one."""
 
+_timed: list[Durations] = []
+"""How long the phases of this process' command take, also while something else shows them."""
+
 
 def show_phase(name: str, done: int = 0, total: int = 0) -> None:
     """Shows that a phase begins, or how much of it is done; does nothing outside of a command."""
+    for durations in _timed:
+        durations.begin(name)
     for status in _shown:
         status.phase(name, done, total)
 
@@ -132,6 +145,11 @@ def say_phase(name: str) -> None:
     """Prints the name of a phase that begins, as a line that stays, and shows its clock."""
     print(name, flush=True)
     show_phase(name)
+
+
+def last_time(name: str) -> float | None:
+    """Returns the seconds that a phase of this process' command took the last time, if that is known."""
+    return next((took for each in _timed if (took := each.last(name)) is not None), None)
 
 
 def end_status() -> None:
@@ -172,7 +190,9 @@ def status_of(title: str, outputs: Sequence[Lasting]) -> Iterator[None]:
         yield
         return
     sys.stderr.flush()
-    status = Status(title, error.fileno(), lives=_is_live(error))
+    durations = Durations(title)
+    status = Status(title, error.fileno(), lives=_is_live(error), durations=durations)
+    _timed.append(durations)
     for output in outputs:
         output.watch(status.make_way)
     _shown.append(status)
@@ -181,6 +201,8 @@ def status_of(title: str, outputs: Sequence[Lasting]) -> Iterator[None]:
         yield
     finally:
         end_status()
+        _timed.remove(durations)
+        durations.keep()
 
 
 def _standard_error(outputs: Sequence[Lasting]) -> Lasting | None:
