@@ -47,7 +47,7 @@ def summarize_run(
         "parameters_from_decisions": result.kept.decisions,
         "reward": reward_record(config, reward),
         "workload": describe_workload(config, preparation.missions[0].training.scene()),
-        "devices": [str(device) for device in preparation.devices],
+        "devices": [_name(device) for device in preparation.devices],
         "processor": describe_processor(),
         "versions": package_versions(),
         "state_digest": digest,
@@ -57,6 +57,11 @@ def summarize_run(
     if tests:
         summary["test"] = summarize_tests(tests, flights)
     return summary
+
+
+def _name(device: jax.Device) -> str:  # pyright: ignore[reportInvalidTypeForm]
+    """Returns the number of a device and, of a card, its model, such as `cuda:0 (NVIDIA H200)`."""
+    return str(device) if device.platform == "cpu" else f"{device} ({device.device_kind})"
 
 
 def summarize_tests(tests: int, flights: Flights) -> dict[str, Any]:
