@@ -20,23 +20,10 @@ from typing import Any
 import jax
 
 from edqn_jax.config.simulation import LOOKS
-from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.decoder import check_predicts_distance
-from edqn_jax.evaluation.evaluate import evaluate
-from edqn_jax.learn.actor import AgentActor
-from edqn_jax.learn.policy import Policy
+from edqn_jax.evaluation.evaluate import evaluate_look
 from edqn_jax.runs.policies import load_policy
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-
-EXACT: dict[str, dict[str, bool | float]] = {
-    "air": {"drag": False, "wind_m_s": 0.0, "gusts_m_s": 0.0},
-    "body": {"mass_share": 0.0, "inertia_share": 0.0},
-    "motors": {"gain_share": 0.0, "lag_s": 0.0},
-    "env": {"setpoint_m_s2": 0.0, "action_delay": 0},
-    "noise": {"position_m": 0.0, "velocity_m_s": 0.0, "position_bias_m": 0.0, "velocity_bias_m_s": 0.0},
-}
-"""Conditions without disturbances: nominal body and motors, no air, no delay, no errors of the state."""
 
 HEAD = (
     "| surface.pattern | reached the goal | collisions | error, median | 90th percentile | frames |\n"
@@ -63,31 +50,14 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 def measure(args: argparse.Namespace, show: Callable[[str], None] = print) -> dict[str, Any]:
     """Returns the report that `--json` writes, and shows a row for each look."""
     policy = load_policy(args.policy)
-    decoder = predicts_distance(policy)
     show(HEAD)
     looks = []
     for look in args.looks:
-        flown = evaluate(
-            policy,
-            args.world,
-            missions=args.missions,
-            seed=args.seed,
-            decoder=decoder,
-            conditions={"surface": {"pattern": look}, **(EXACT if args.exact else {})},
-        )
+        flown = evaluate_look(policy, args.world, look, missions=args.missions, seed=args.seed, exact=args.exact)
         looks.append({"pattern": look, **flown.figures})
         show(row(looks[-1]))
     cell = {"policy": str(args.policy), "world": args.world, "seed": args.seed, "exact": args.exact}
     return {**json_report.machine(jax.devices()), "cell": cell, "looks": looks}
-
-
-def predicts_distance(policy: Policy) -> bool:
-    """Returns whether a policy has a decoder that predicts distance."""
-    try:
-        check_predicts_distance(policy.config, AgentActor(policy.config))
-    except ConfigError:
-        return False
-    return True
 
 
 def row(look: dict[str, Any]) -> str:

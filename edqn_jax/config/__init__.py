@@ -1,7 +1,7 @@
 """Every option, its default and its limits, and how a configuration is loaded."""
 
 from edqn_jax.config.learning import AgentConfig, EncoderConfig, TrainConfig
-from edqn_jax.config.options import CONDITIONS, Config
+from edqn_jax.config.options import CONDITIONS, EXACT, Config
 from edqn_jax.config.presets import PRESETS, get_preset
 from edqn_jax.config.registry import (
     ACTION_SETS,
@@ -34,6 +34,7 @@ __all__ = [
     "AIRFRAMES",
     "CONDITIONS",
     "ENCODERS",
+    "EXACT",
     "FAMILIES",
     "LEARNERS",
     "MIXTURES",

@@ -69,3 +69,12 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
     },
 }
 """Options by group that a policy may be flown with other values of than it was trained with."""
+
+EXACT: dict[str, dict[str, bool | float]] = {
+    "air": {"drag": False, "wind_m_s": 0.0, "gusts_m_s": 0.0},
+    "body": {"mass_share": 0.0, "inertia_share": 0.0},
+    "motors": {"gain_share": 0.0, "lag_s": 0.0},
+    "env": {"setpoint_m_s2": 0.0, "action_delay": 0},
+    "noise": {"position_m": 0.0, "velocity_m_s": 0.0, "position_bias_m": 0.0, "velocity_bias_m_s": 0.0},
+}
+"""Conditions without disturbances: nominal body and motors, no air, no delay, no errors of the state."""

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from edqn_jax.config import Config
+from edqn_jax.config import EXACT, Config
 from edqn_jax.config.loading import Layer, with_conditions
 from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
@@ -19,6 +19,7 @@ from edqn_jax.evaluation.metrics import shortest_paths, summarise_flights
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.places import Point
 from edqn_jax.evaluation.rollouts import ShowPhase, fly_on_all_devices, show_nothing
+from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import Function, FunctionPolicy, actor_of, as_policy, config_of
 from edqn_jax.policies.unseen import describe_unseen
@@ -124,6 +125,24 @@ def evaluate(
     show("shortest paths")
     shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
     return Evaluation(note_unseen(policy, config, mission_set), flights, _figures(config, flights, shortest))
+
+
+def evaluate_look(
+    policy: Policy, world: str | None, look: str, *, missions: int = 1, seed: int = 0, exact: bool = False
+) -> Evaluation:
+    """Flies a policy as `evaluate` does where all surfaces have one look, and measures its decoder if it has one.
+
+    Args:
+        policy: as of `evaluate`.
+        world: as of `evaluate`.
+        look: `surface.pattern`.
+        missions: how many.
+        seed: which missions.
+        exact: whether without the disturbances of the policy's training, see `config.EXACT`.
+    """
+    conditions = {"surface": {"pattern": look}, **(EXACT if exact else {})}
+    decoder = embedding.needs_nearness(policy.config)
+    return evaluate(policy, world, missions=missions, seed=seed, decoder=decoder, conditions=conditions)
 
 
 def _figures(config: Config, flights: Flights, shortest: np.ndarray) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from edqn_jax.config import EXACT
 from edqn_jax.config.loading import to_yaml, with_conditions
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.sim.physics.disturbances import any_on
@@ -24,12 +25,12 @@ def test_every_look_has_a_row_with_success_and_the_decoders_error(tmp_path, caps
     assert looks.row(look) in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("group, option", [(group, option) for group in looks.EXACT for option in looks.EXACT[group]])
+@pytest.mark.parametrize("group, option", [(group, option) for group in EXACT for option in EXACT[group]])
 def test_an_exact_flight_has_no_disturbance(group, option):
     disturbed = with_conditions(
         CONFIG, {group: {option: {"drag": True, "action_delay": 1}.get(option, 0.1)}}, "evaluate"
     )
-    assert any_on(disturbed) and not any_on(with_conditions(disturbed, looks.EXACT, "evaluate"))
+    assert any_on(disturbed) and not any_on(with_conditions(disturbed, EXACT, "evaluate"))
 
 
 def test_a_policy_without_a_decoder_has_dashes():
