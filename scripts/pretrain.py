@@ -5,15 +5,19 @@ r"""Makes a policy that comes with the package: trains five seeds, measures the 
     python scripts/pretrain.py --kind further --start-from runs/looks-first --run runs/further \
         --out runs/looks-further
     python scripts/pretrain.py --kind autopilot --world narrow --start-from runs/looks-further --run runs/autopilot \
-        --out edqn_jax/policies/pretrained-looks
+        --seeds 1 --measured runs/looks.md --out edqn_jax/policies/pretrained-looks
     python scripts/pretrain.py --kind body --world narrow --start-from edqn_jax/policies/pretrained-looks \
-        --run runs/body --out edqn_jax/policies/pretrained-body
+        --run runs/body --seeds 1 --out edqn_jax/policies/pretrained-body
 
 Training needs a GPU: for `mixed` worlds 24 minutes on two H100, 16 of them training (`train.py ... --train.devices 2`,
 with the options that this script has), for `open` ones eight on one. Where --run holds the seeds already, the best is
-only measured, which takes half an hour on one core for six families, most of it A* for the SPL. The best seed is the
-one with the highest success in the validation worlds, SPL among equals; nothing that is measured afterwards has a say
-in it.
+only measured, which takes half an hour on one core for six families, most of it A* for the SPL; a policy of any look
+is measured for each of --looks. The best seed is the one with the highest success in the validation worlds, SPL among
+equals; nothing that is measured afterwards has a say in it.
+
+The card of a policy of any look has a place for what other commands measure: true depth and blind, verdicts, the parts
+of others, the wire. Such figures come from the Markdown of --measured, a section `### NAME` each (`### Limits` adds to
+the limits), and the card names the command of those that are missing.
 """
 
 from __future__ import annotations
@@ -25,13 +29,13 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import edqn_jax
-from edqn_jax.config import MIXTURES
+import model_card
+from edqn_jax.config import EXACT, MIXTURES
+from edqn_jax.config.simulation import LOOKS as PATTERNS
 from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.evaluate import Evaluation, evaluate
+from edqn_jax.evaluation.evaluate import evaluate, evaluate_look
 from edqn_jax.files import write_atomically
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy, save_policy
@@ -89,85 +93,26 @@ look."""
 MISSIONS = 1000
 """Test worlds of each family; training never uses them."""
 
-CARD = """# Model card: `pretrained`
-
-A policy for random worlds ({families}), flown from simulated events.
-`edqn evaluate pretrained --world FILE.xml` flies it, `edqn_jax.load_policy("pretrained")` loads it.
-
-| | |
-| --- | --- |
-| trained on | {pool:,} worlds (`--world {world} --surface.pattern plaid`, the training split), {missions:,} missions |
-| training | {decisions:,} decisions in {envs:,} environments, last averaged parameters; {trained} |
-| seed | {seed}, the best of {seeds} in the validation worlds |
-| sees | events of the last {window:g} s (threshold {threshold:g}), its own state and motion |
-| camera | level, {width} x {height} pixels, {fov:g} degrees across |
-| format | configuration in `config.yaml`, parameters in `checkpoints/policy.safetensors` (arrays, no pickle) |
-| trained at | commit `{commit}`, with the options in `config.yaml` |
-| made by | `scripts/pretrain.py`, which trains with these options, edqn_jax {version} |
-
-## Measured
-
-Greedy flights through test worlds, which neither training nor any choice has used; physics by MJX.
-
-| world | missions | success | 95 % interval (Wilson) | SPL | collisions | other failures |
-| --- | ---: | ---: | ---: | ---: | ---: | ---: |
-{rows}
-
-The paper's own map, never trained on: {paper}
-
-## Limits
-
-- The best of {seeds} training seeds, of which {arrived} reach the goal of the paper's map.
-- Simulated events from rendered brightness: no noise, no lens, uniform thresholds, static worlds, no wind. It has not
-  been flown on a real drone, and must not be.
-- The map's bounds matter: the own position is given relative to the flight volume, and only worlds of these
-  families' sizes have been measured: 110 x 110 x 25 m open ones, 36 to 60 m across closed ones.
-- It collides with obstacles in full view and with ones just outside of the camera's view:
-  `benchmarks/failures.py pretrained --world medium` lists them.
-"""
+TEST_SEED = 11
+"""Of the test missions of a policy of any look."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 when the policy and its card are written, 2 for invalid input."""
-    parser = argparse.ArgumentParser(
-        prog="python scripts/pretrain.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--run", type=Path, required=True, help="folder of the runs; trained if there are none")
-    parser.add_argument("--out", type=Path, required=True, help="folder of policy and card; replaced")
-    parser.add_argument("--world", choices=sorted(DECISIONS), default="mixed", help="to train on (default mixed)")
-    parser.add_argument("--kind", choices=sorted(KINDS), default="plaid", help="of policy (default plaid)")
-    parser.add_argument("--start-from", type=Path, help="policy that `further`, `autopilot` and `body` begin with")
-    parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a family (default {MISSIONS})")
-    parser.add_argument("--trained", help="where and how long the run was trained, if its summary.json does not say")
-    parser.add_argument("--commit", help="commit that the run was trained at; needed if it is not trained now")
-    args = parser.parse_args(argv)
-    if args.missions < 1:
-        parser.error(f"--missions must be at least 1, not {args.missions}")
-    if (args.kind in ("further", "autopilot", "body")) != (args.start_from is not None):
-        parser.error("--start-from is for the kinds further, autopilot and body, and needed there")
+    args = parse(argv)
     trained = args.run.is_dir()
-    if trained and args.commit is None:
-        parser.error(f"'{args.run}' was trained before; say with --commit at which commit")
     try:
         _check_replaceable(args.out)
+        measured = {} if args.measured is None else read_measured(args.measured)
         if not trained:
             begin = [] if args.start_from is None else ["--start-from", str(args.start_from)]
-            _train(args.run, [*options_of(args.world, args.kind), *begin])
+            _train(args.run, [*options_of(args.world, args.kind), *begin], args.first_seed, args.seeds)
         use_cpu_devices()
-        run = best_of(args.run)
+        run = best_of(args.run, args.seeds)
         policy = load_policy(run)
         if (found := policy.config.world.name) != args.world:
             raise ConfigError(f"'{args.run}' was trained in '{found}' worlds, not '{args.world}'; give --world {found}")
-        flown = {world: evaluate(policy, world, missions=args.missions) for world in families_of(policy)}
-        paper = {each: evaluate(load_policy(each), "paper") for each in seeds_of(args.run)}
-        card = card_of(
-            policy,
-            flown,
-            paper[run],
-            sum(each.figures["successes"] for each in paper.values()),
-            args.trained or _trained(run),
-            args.commit or _commit(),
-        )
+        card = measure(args, policy, run, measured)
         shutil.rmtree(args.out, ignore_errors=True)
         save_policy(policy, args.out)
         write_atomically(args.out / "README.md", card)
@@ -178,41 +123,81 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def card_of(
-    policy: Policy, flown: dict[str, Evaluation], paper: Evaluation, arrived: int, trained: str, commit: str
-) -> str:
-    """Returns the model card of a policy and its flights; `arrived` of the seeds reach the goal of the paper's map."""
-    config = policy.config
-    rows = []
-    for world, evaluation in flown.items():
-        found = evaluation.figures
-        low, high = found["interval"]
-        others = found["left_volume"] + found["timeouts"] + found["diverged"]
-        rows.append(
-            f"| {world} | {found['missions']} | {found['success_rate']:.1%} | {low:.1%} to {high:.1%} "
-            f"| {found['spl']:.3f} | {found['collisions']} | {others} |"
-        )
-    return CARD.format(
-        families=", ".join(flown),
-        world=config.world.name,
-        pool=config.world.pool_size,
-        missions=config.world.missions,
-        decisions=config.train.total_steps,
-        envs=config.train.num_envs,
-        seed=config.train.seed,
-        seeds=SEEDS,
-        arrived=arrived,
-        trained=trained,
-        width=config.camera.width,
-        height=config.camera.height,
-        fov=config.camera.horizontal_fov_deg,
-        threshold=config.events.threshold,
-        window=-config.events.frame_times_s[0],
-        commit=commit,
-        version=edqn_jax.__version__,
-        rows="\n".join(rows),
-        paper=_paper(paper.figures, config.drone.body_radius_m),
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Returns the parsed arguments; ends the program where they are invalid."""
+    parser = argparse.ArgumentParser(
+        prog="python scripts/pretrain.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--run", type=Path, required=True, help="folder of the runs; trained if there are none")
+    parser.add_argument("--out", type=Path, required=True, help="folder of policy and card; replaced")
+    parser.add_argument("--world", choices=sorted(DECISIONS), default="mixed", help="to train on (default mixed)")
+    parser.add_argument("--kind", choices=sorted(KINDS), default="plaid", help="of policy (default plaid)")
+    parser.add_argument("--start-from", type=Path, help="policy that `further`, `autopilot` and `body` begin with")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help=f"agents that are trained (default {SEEDS})")
+    parser.add_argument("--first-seed", type=int, default=0, help="of the first agent (default 0)")
+    parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a family (default {MISSIONS})")
+    parser.add_argument("--test-seed", type=int, help=f"of the test missions (default {TEST_SEED}, of one plaid 0)")
+    parser.add_argument("--looks", nargs="+", choices=PATTERNS, help="that are flown (default all; not for one plaid)")
+    parser.add_argument("--measured", type=Path, help="Markdown of what other commands measured; not for one plaid")
+    parser.add_argument("--trained", help="where and how long the run was trained, if its summary.json does not say")
+    parser.add_argument("--commit", help="commit that the run was trained at; needed if it is not trained now")
+    args = parser.parse_args(argv)
+    for name in ("missions", "seeds"):
+        if getattr(args, name) < 1:
+            parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
+    if (args.kind in ("further", "autopilot", "body")) != (args.start_from is not None):
+        parser.error("--start-from is for the kinds further, autopilot and body, and needed there")
+    if args.kind == "plaid" and (args.looks or args.measured):
+        parser.error("--looks and --measured are for the kinds of any look")
+    if args.run.is_dir() and args.commit is None:
+        parser.error(f"'{args.run}' was trained before; say with --commit at which commit")
+    if args.test_seed is None:
+        args.test_seed = 0 if args.kind == "plaid" else TEST_SEED
+    return args
+
+
+def measure(args: argparse.Namespace, policy: Policy, run: Path, measured: dict[str, str]) -> str:
+    """Returns the card of a policy, which flies its test worlds.
+
+    Args:
+        args: of `parse`.
+        policy: the best of the seeds.
+        run: of that seed.
+        measured: what other commands measured, see `model_card.sections_of`.
+    """
+    paper = {each: evaluate(load_policy(each), "paper", conditions=EXACT) for each in seeds_of(args.run, args.seeds)}
+    origin = model_card.Origin(
+        folder=args.out,
+        kind=args.kind,
+        validations={load_policy(each).config.train.seed: _validation(each)[0] for each in paper},
+        arrived=sum(each.figures["successes"] for each in paper.values()),
+        trained=args.trained or _trained(run),
+        commit=args.commit or _commit(),
+        began_with=args.start_from,
+    )
+    families, missions, seed = families_of(policy), args.missions, args.test_seed
+    if args.kind == "plaid":
+        flown = {world: evaluate(policy, world, missions=missions, seed=seed) for world in families}
+        return model_card.plaid_card(policy, origin, flown, paper[run])
+    looks = {
+        look: {
+            world: evaluate_look(policy, world, look, missions=missions, seed=seed, exact=True) for world in families
+        }
+        for look in args.looks or PATTERNS
+    }
+    return model_card.looks_card(policy, origin, looks, paper[run], seed, measured)
+
+
+def read_measured(file: Path) -> dict[str, str]:
+    """Returns the sections of a file of measurements.
+
+    Raises:
+        ConfigError: if it cannot be read, or is no such file.
+    """
+    try:
+        return model_card.sections_of(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"'{file}' cannot be read: {error}") from None
 
 
 def options_of(world: str, kind: str = "plaid") -> list[str]:
@@ -229,47 +214,39 @@ def families_of(policy: Policy) -> list[str]:
     return list(MIXTURES.get(name, [name]))
 
 
-def best_of(folder: Path) -> Path:
+def best_of(folder: Path, seeds: int = SEEDS) -> Path:
     """Returns the run of the seed with the highest success in the validation worlds, SPL among equals.
 
     Raises:
-        ConfigError: if the folder holds no finished run of a seed.
+        ConfigError: if the folder holds fewer finished runs.
     """
-
-    def validation(run: Path) -> tuple[float, float]:
-        summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-        return summary["validation_success"], summary["validation_spl"]
-
-    return max(seeds_of(folder), key=validation)
+    return max(seeds_of(folder, seeds), key=_validation)
 
 
-def seeds_of(folder: Path) -> list[Path]:
+def seeds_of(folder: Path, seeds: int = SEEDS) -> list[Path]:
     """Returns the runs of the seeds that a folder holds.
 
     Raises:
-        ConfigError: if fewer than `SEEDS` are finished.
+        ConfigError: if another number of them is finished.
     """
-    runs = sorted(file.parent for file in folder.glob("seed-*/summary.json"))
-    if len(runs) < SEEDS:
+    runs = sorted((file.parent for file in folder.glob("seed-*/summary.json")), key=lambda run: (len(run.name), run))
+    if len(runs) < seeds:
         raise ConfigError(
-            f"'{folder}' holds {len(runs)} finished seeds of {SEEDS}; continue it with train.py --run-dir"
+            f"'{folder}' holds {len(runs)} finished seeds of {seeds}; continue it with train.py --run-dir"
         )
+    if len(runs) > seeds:
+        raise ConfigError(f"'{folder}' holds {len(runs)} finished seeds; give --seeds {len(runs)}, so that all count")
     return runs
 
 
-def _paper(figures: dict[str, Any], radius: float) -> str:
-    if not figures["successes"]:
-        return "it does not reach the goal."
-    return (
-        f"it reaches the goal after {figures['decisions']:.0f} decisions (the paper: 188), "
-        f"{figures['path_length_m']:.1f} m ({figures['path_over_shortest']:.2f} times A*'s path), with "
-        f"{figures['min_clearance_m']:.2f} m "
-        f"({figures['min_clearance_m'] / radius:.1f} body radii) to spare."
-    )
+def _validation(run: Path) -> tuple[float, float]:
+    """Returns success and SPL of a run in the validation worlds."""
+    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
+    return summary["validation_success"], summary["validation_spl"]
 
 
-def _train(run: Path, options: Sequence[str]) -> None:
-    asked = [*options, "--seeds", str(SEEDS), "--run-dir", str(run)]
+def _train(run: Path, options: Sequence[str], first: int, seeds: int) -> None:
+    asked = [*options, "--seed", str(first), "--seeds", str(seeds), "--run-dir", str(run)]
     code = subprocess.run([sys.executable, str(ROOT / "train.py"), *asked]).returncode
     if code:
         raise ConfigError(f"the training in '{run}' ended with exit code {code}; what it printed says why")

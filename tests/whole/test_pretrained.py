@@ -51,7 +51,7 @@ def test_the_card_of_the_policy_of_any_look_has_a_row_for_each_look_and_family()
     card, config = (policy_folder(Path(LOOKS)) / "README.md").read_text(), edqn_jax.load_policy(LOOKS).config
     assert f"{config.train.total_steps:,}" in card and config.surface.pattern == "drawn"
     for look in ("drawn", "blank", "bricks", "posters", "wood"):
-        assert re.search(rf"^\| `{look}` (\| \d+\.\d ){{6}}\|$", card, re.MULTILINE), look
+        assert re.search(rf"^\| `{look}` (\| \d+\.\d( \([\d.–]+\))? ){{6}}\|$", card, re.MULTILINE), look
 
 
 def test_saved_files_name_no_folder_of_the_computer_that_wrote_them(tmp_path: Path) -> None:
