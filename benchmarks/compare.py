@@ -14,7 +14,10 @@ A commit can be compared if it has a worker, benchmarks/measurement/worker.py or
 benchmarks/worker.py: that is every commit since this script was added. The layout of the rest of the commit does not
 matter, because its own worker times it. Both commits must run with the packages that are installed here.
 
-Arguments after -- are options of train.py; both commits are timed with them, so both must have them.
+    python benchmarks/compare.py HEAD HEAD --rows whole_training_step -- --world medium -- --surface.pattern drawn
+
+Arguments after -- are options of train.py; both commits are timed with them, so both must have them. Those after a
+second -- are for B alone, so that a commit shows what options cost.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import shlex
 import statistics
 import subprocess
 import sys
@@ -177,9 +181,22 @@ def compared(name: str, first: Sequence[float], second: Sequence[float]) -> dict
 
 
 def measure(
-    root: Path, names: Sequence[str], rows: Sequence[str], repeats: int, words: Sequence[str]
+    root: Path,
+    names: Sequence[str],
+    rows: Sequence[str],
+    repeats: int,
+    quick: bool,
+    options: Mapping[str, Sequence[str]],
 ) -> dict[str, Any]:
     """Times both commits and returns the report that `--json` writes.
+
+    Args:
+        root: the repository.
+        names: of the commits.
+        rows: that are timed, all where empty.
+        repeats: turns of each row.
+        quick: whether the turns are short.
+        options: of train.py: `both` of both sides, `b` of B alone.
 
     Raises:
         ConfigError: if a commit does not exist or cannot be timed.
@@ -190,6 +207,7 @@ def measure(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         workers = []
         for side, commit in zip("ab", commits, strict=True):
+            words = [*(["--quick"] if quick else []), "--", *options["both"], *(options["b"] if side == "b" else ())]
             checkout = stack.enter_context(check_out(root, commit, folder / f"{side}-{commit[:10]}"))
             workers.append(stack.enter_context(Worker(checkout, rows, words, folder / f"{side}.log")))
         for worker in workers:
@@ -207,6 +225,7 @@ def measure(
         "devices": second["devices"],
         "versions": second["versions"],
         "commits": [{"name": name, "commit": commit} for name, commit in zip(names, commits, strict=True)],
+        "options": {side: list(flags) for side, flags in options.items()},
         "differing": differing(first, second),
         "repeats": repeats,
         "rows": [compared(row, *turns[row]) for row in common],
@@ -223,9 +242,9 @@ def table(report: dict[str, Any]) -> str:
     """Returns the report as a Markdown table."""
     a, b = report["commits"]
     lines = [
-        f"A is {a['name']} ({a['commit'][:10]}), B is {b['name']} ({b['commit'][:10]}); {report['device']}, "
-        f"{len(report['devices'])} devices, {report['workload']['num_envs']} environments; {report['repeats']} turns "
-        "each. Below 1, B is faster.",
+        f"A is {a['name']} ({a['commit'][:10]}), B is {b['name']} ({b['commit'][:10]}){_own(report)}; "
+        f"{report['device']}, {len(report['devices'])} devices, {report['workload']['num_envs']} environments; "
+        f"{report['repeats']} turns each. Below 1, B is faster.",
         "",
         "| µs of one device per decision | A | B | B / A | interval |",
         "| --- | ---: | ---: | ---: | ---: |",
@@ -241,13 +260,19 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, list[str]]:
-    """Returns the parsed arguments, and the arguments that both workers pass to their `throughput.py`.
+def _own(report: Mapping[str, Any]) -> str:
+    """Returns the options of B alone, for people."""
+    return f" with {shlex.join(report['options']['b'])}" if report["options"]["b"] else ""
+
+
+def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, dict[str, list[str]]]:
+    """Returns the parsed arguments, and the options of train.py, see `measure`.
 
     Raises:
         ConfigError: if a row is unknown, the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(argv)
+    both, own = split(flags)
     parser = Parser("compare", __doc__, epilog="All rows take about five minutes on two cores.")
     parser.add_argument("a", metavar="COMMIT_A", help="the commit to compare with")
     parser.add_argument("b", metavar="COMMIT_B", help="the commit to compare")
@@ -262,15 +287,16 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, list[s
     for row in args.rows:
         if row not in (WHOLE, *PARTS):
             raise ConfigError(f"there is no row '{row}'; there are {', '.join((WHOLE, *PARTS))}")
-    parse_config(flags)  # raises before anything is checked out
-    return args, [*(["--quick"] if args.quick else []), "--", *flags]
+    for flags in (both, [*both, *own]):
+        parse_config(flags)  # raises before anything is checked out
+    return args, {"both": both, "b": own}
 
 
 @in_a_sentence
 def main(argv: Sequence[str] | None = None, root: Path = ROOT) -> int:
     """Returns exit code 0 after both commits were timed, 2 for invalid input."""
-    args, words = parse(argv)
-    report = measure(root, [args.a, args.b], args.rows, args.repeats, words)
+    args, options = parse(argv)
+    report = measure(root, [args.a, args.b], args.rows, args.repeats, args.quick, options)
     print(table(report))
     json_report.write(args.json, report)
     return 0

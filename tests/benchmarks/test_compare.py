@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,7 +30,10 @@ wanted, costs = json.loads(sys.argv[1]), {costs}
 about = {{
     "package": edqn_jax.__file__,
     "rows": [row for row in costs if not wanted or row in wanted],
-    "workload": {{"num_envs": int(sys.argv[sys.argv.index("--num-envs") + 1])}},
+    "workload": {{
+        "num_envs": int(sys.argv[sys.argv.index("--num-envs") + 1]),
+        "sensor": "frames" if "frames" in sys.argv else "events",
+    }},
     "device": "a machine",
     "devices": ["cpu:0"],
     "versions": {{}},
@@ -178,6 +182,19 @@ def test_each_commit_is_timed_by_its_own_worker_wherever_that_is(
     assert report["workload"]["num_envs"] == 16 and report["differing"] == {}
     assert "| acting | 8.0 | 4.0 | 0.500 | 0.500 - 0.500 |" in capsys.readouterr().out
     assert len(git(repository, "worktree", "list").splitlines()) == 1
+
+
+def test_options_of_b_alone_are_those_after_a_second_pair_of_dashes(
+    repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "compare.json"
+    words = ["slow", "slow", "--repeats", "1", "--json", str(file), "--", *MINIATURE, "--", "--env.sensor", "frames"]
+    assert compare.main(words, repository) == 0
+    report = json.loads(file.read_text())
+    assert report["options"] == {"both": list(MINIATURE), "b": ["--env.sensor", "frames"]}
+    assert report["differing"] == {"sensor": ["events", "frames"]}
+    assert re.search(r"B is slow \(\w+\) with --env.sensor frames; a machine", capsys.readouterr().out)
+    assert compare.main([*words[:-1], "eyes"], repository) == 2 and "eyes" in capsys.readouterr().err
 
 
 def test_a_row_that_a_commit_does_not_have_is_told(repository: Path, capsys: pytest.CaptureFixture[str]) -> None:
