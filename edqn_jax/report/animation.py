@@ -31,7 +31,8 @@ from edqn_jax.report.images import error_caption, look_of, scale_of
 from edqn_jax.report.sights import FlightRenderer, decision_rows, times_of, trajectory_poses
 from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE, frame
 from edqn_jax.report.worlds.flights import OBLIQUE, OTHER_COLOUR, others_paths, plot_end_marks, plot_stage
-from edqn_jax.report.worlds.solids import MAP, View, faces_seen, is_occluded, moving_solids
+from edqn_jax.report.worlds.solids import faces_seen, is_occluded, moving_solids
+from edqn_jax.report.worlds.views import MAP, View
 from edqn_jax.sim.camera.camera import on_screen
 from edqn_jax.sim.scene.scene import has_motion
 

@@ -16,7 +16,8 @@ from edqn_jax.report.curves import plot_learning, plot_returns, running_mean
 from edqn_jax.report.images import EVENTS, NEARNESS, error_caption, plot_reconstruction, plot_sight
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.report.worlds.flights import OBLIQUE, plot_path, plot_world
-from edqn_jax.report.worlds.solids import MAP, View, far_to_near, is_occluded, make_cutaway, solids_of
+from edqn_jax.report.worlds.solids import far_to_near, is_occluded, make_cutaway, solids_of
+from edqn_jax.report.worlds.views import MAP, View
 from edqn_jax.sim.scene.scene import (
     Scene,
     UprightBoxes,
@@ -339,16 +340,17 @@ def test_the_caption_of_a_prediction_says_how_far_its_distance_is_off(tmp_path):
     assert error_caption(np.full(true.shape, np.inf), true) == "predicted far away"
 
 
-def test_what_is_above_start_and_goal_is_cut_off_and_a_map_is_a_slice(roofed: Scene) -> None:
+def test_what_is_above_start_and_goal_is_cut_off_and_on_a_map_what_is_below_is_pale(roofed: Scene) -> None:
     oblique, above = make_cutaway(roofed, OBLIQUE), make_cutaway(roofed, MAP)
-    assert oblique.note == "cut off above 4.0 m" and above.note == "cut off above 4.0 m, and below 1.5 m"
+    assert oblique.note == "near walls cut away; cut at 4.0 m"
+    assert above.note == "cut at 4.0 m, pale below 1.5 m"
     for world in (oblique, above):
-        assert max(solid.corners[:, 2].max() for solid in world.shown) <= 4.0
-        assert all(np.all(np.isfinite(solid.outward)) for solid in world.shown)
+        assert max(solid.corners[:, 2].max() for solid in world.hiding) <= 4.0
+        assert all(np.all(np.isfinite(solid.outward)) for solid in world.hiding)
     middle = np.array([[10.0, 5.0, 2.5], [2.2, 5.0, 1.6]])
-    assert list(is_occluded(middle, oblique.shown, MAP)) == [False, True]
+    assert list(is_occluded(middle, oblique.hiding, MAP)) == [False, True]
     floor = middle * [1, 1, 0] + [0, 0, 0.2]
-    assert list(is_occluded(floor, oblique.shown, MAP)) == [True, True]
-    assert list(is_occluded(floor, above.shown, MAP)) == [False, True]
+    assert list(is_occluded(floor, oblique.hiding, MAP)) == [True, True]
+    assert list(is_occluded(floor, above.hiding, MAP)) == [False, True]
     outside = dataclasses.replace(roofed, start=np.array([1.0, 5.0, 2.5]), goal=np.array([19.0, 5.0, 3.0]))
     assert make_cutaway(outside, MAP).cut is None

@@ -16,7 +16,8 @@ from edqn_jax.planning.lattice import clearances
 from edqn_jax.planning.widest import COMFORT_M, ENDS_M, WidestWay
 from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, open_figure
 from edqn_jax.report.worlds.flights import draw_map, plot_coloured
-from edqn_jax.report.worlds.solids import MAP, is_occluded, make_cutaway
+from edqn_jax.report.worlds.solids import is_occluded, make_cutaway
+from edqn_jax.report.worlds.views import MAP
 from edqn_jax.sim.scene.mesh_field import spread_directions
 from edqn_jax.sim.scene.scene import Scene
 
@@ -70,7 +71,7 @@ def plot_check(
         scale = Normalize(radius, radius + COMFORT_M)
         above = figure.add_subplot(grid[:, 0])
         _plot_map(above, scene, goal_radius_m)
-        hidden = is_occluded(way.points, make_cutaway(scene, MAP).shown, MAP)
+        hidden = is_occluded(way.points, make_cutaway(scene, MAP).hiding, MAP)
         _plot_way(above, way.points[:, :2], way.clearance, scale, hidden)
         reach = max(_CLOSE_UP_M, 1.4 * way.clearance_m)
         _mark(above, way.points[way.tightest][:2], reach)

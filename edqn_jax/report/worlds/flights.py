@@ -19,10 +19,7 @@ from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.evaluation.trajectories import POSITION, VELOCITY, columns_of
 from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, open_figure
 from edqn_jax.report.worlds.solids import (
-    GROUND,
-    MAP,
     Solid,
-    View,
     is_occluded,
     make_cutaway,
     plot_outlines,
@@ -31,6 +28,7 @@ from edqn_jax.report.worlds.solids import (
     plot_solids,
     static_scene,
 )
+from edqn_jax.report.worlds.views import GROUND, MAP, View
 from edqn_jax.sim.scene.scene import PARKED, Scene
 
 OBLIQUE = View(azimuth=-62.0, elevation=34.0)
@@ -155,7 +153,7 @@ def plot_stage(axes: Axes, view: View, scene: Scene, goal_radius_m: float, outli
 
     Args:
         axes: to draw on.
-        view: `OBLIQUE` or `solids.MAP`.
+        view: `OBLIQUE` or `MAP`.
         scene: one world.
         goal_radius_m: the circle around the goal on the map.
         outlines: whether what moves is outlined where it is at time 0.
@@ -175,13 +173,13 @@ def _plot_obstacles(axes: Axes, view: View, scene: Scene) -> list[Solid]:
     """Draws the world without what would hide it, says so, and returns the solids that hide what is behind them."""
     world = make_cutaway(scene, view)
     if view is not MAP:
-        plot_shadows(axes, view, world.shown, _corners(np.asarray(scene.volume, np.float64)))
+        plot_shadows(axes, view, world.hiding, _corners(np.asarray(scene.volume, np.float64)))
     plot_passable(axes, view, world.passable)
-    plot_solids(axes, view, world.shown)
+    plot_solids(axes, view, world.shown, world.meshes)
     plot_outlines(axes, view, [*world.near_walls, *world.moving])
     if world.note:
         axes.set_title(world.note, fontsize=7, weight="normal", color=MUTED)
-    return world.shown
+    return world.hiding
 
 
 def _ends(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

@@ -16,22 +16,21 @@ from matplotlib.collections import PolyCollection
 from matplotlib.patches import Polygon
 
 from edqn_jax.config import SHAPES
+from edqn_jax.report.worlds.meshes import Mesh, mesh_of_shape, plot_meshes
+from edqn_jax.report.worlds.views import SUN, View, pale, shaded
 from edqn_jax.sim.scene.scene import PARKED, Scene, scene_at
 from edqn_jax.sim.scene.shapes.kind import ShapeKind
 
-SUN = np.array([-0.45, -0.6, 0.66])
-"""Direction towards the light of the pictures; a unit vector, near enough."""
-GROUND = "#f4f3ef"
 SHADOW = "#dedcd5"
 OUTLINE = "#a8a8a4"
 ABOVE_M = 1.0
 """Metres above start and goal at which what is above them is cut off, and below them what a map shows no more."""
+NEAR_WALL_M = 0.3
+"""Metres of a mesh around a flight that are cut away on the side of the eye."""
 NEARLY_ALL = 0.75
 """Share of the volume's width that a ceiling or an outer wall covers."""
 PASSABLE_M = 1.0
 """Metres between a solid and the floor or the ceiling from which on a map shows it as open."""
-PALE = 0.3
-"""Share of its own colour that an open solid has on a map; the rest is the ground's."""
 
 
 @dataclass(frozen=True)
@@ -54,31 +53,6 @@ class Solid:
         middles = np.stack([face.mean(0) for face in self.faces])
         sides = np.sign(np.sum(normals * (middles - centre), axis=1, keepdims=True))
         return normals * sides
-
-
-@dataclass(frozen=True)
-class View:
-    """An orthographic view of the world. Angles in degrees; elevation 90 is a map with x to the right."""
-
-    azimuth: float
-    elevation: float
-
-    @property
-    def towards(self) -> np.ndarray:
-        """Unit vector from the world to the eye, [3]."""
-        a, e = np.radians([self.azimuth, self.elevation])
-        return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-
-    def project(self, points: np.ndarray) -> np.ndarray:
-        """Returns points [..., 3] of the world, metres, on the picture: [..., 2] metres, x to the right and y up."""
-        a, e = np.radians([self.azimuth, self.elevation])
-        right = np.array([-np.sin(a), np.cos(a), 0.0])
-        up = np.array([-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)])
-        return np.asarray(points) @ np.stack([right, up], axis=1)
-
-
-MAP = View(azimuth=-90.0, elevation=90.0)
-"""From straight above, x to the right and y up."""
 
 
 def solids_of(scene: Scene) -> list[Solid]:
@@ -150,6 +124,7 @@ class CutawayView:
     """A world's solids for one view, sorted into what is drawn and what would hide all the rest."""
 
     shown: list[Solid]
+    """Convex solids that are drawn as they are."""
     near_walls: list[Solid]
     """Walls along the rim of the volume, on the side of the eye: drawn as outlines."""
     has_ceiling: bool
@@ -157,19 +132,29 @@ class CutawayView:
     moving: list[Solid]
     """What moves, where it is at time 0: drawn as outlines."""
     cut: tuple[float, float] | None = None
-    """Heights, metres, between which a shape is shown."""
+    """Heights, metres, above which a shape is cut off, and below which it is pale."""
     passable: list[Solid] = dataclasses.field(default_factory=list)
     """On a map: the wall above a door, and what else can be flown under or, below a ceiling, over; drawn pale."""
+    meshes: list[Mesh] = dataclasses.field(default_factory=list)
+    """Meshes that are drawn as they are."""
+    within: list[Solid] = dataclasses.field(default_factory=list)
+    """Convex solids that fill those meshes, as far as they are shown."""
+
+    @property
+    def hiding(self) -> list[Solid]:
+        """Solids that hide what is behind them."""
+        return [*self.shown, *self.within]
 
     @property
     def note(self) -> str:
         """Note on what was cut away, for the figure; empty if nothing was."""
-        parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", self.near_walls)) if cut]
+        walls = self.near_walls or any(len(mesh.cuts) > 1 for mesh in self.meshes)
+        parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", walls)) if cut]
         notes = [f"{' and '.join(parts)} cut away"] if parts else []
         notes += ["open is pale"] if self.passable else []
         if self.cut is not None:
             low, high = self.cut
-            notes.append(f"cut off above {high:.1f} m" + (f", and below {low:.1f} m" if np.isfinite(low) else ""))
+            notes.append(f"cut at {high:.1f} m" + (f", pale below {low:.1f} m" if np.isfinite(low) else ""))
         return "; ".join(notes + (["outlined: what moves, as at the start"] if self.moving else []))
 
 
@@ -188,14 +173,22 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
     planes = zip(np.asarray(scene.planes.position), np.asarray(scene.planes.normal), strict=True)
     has_ceiling = any(normal[2] < -0.9 and middle < position[2] < PARKED / 10 for position, normal in planes)
     shown, near_walls, solids, cut = [], [], [], None
+    meshes, within = [], []
     for kind, shape in standing_rows(static_scene(scene)):
-        parts = solids_of_shape(kind, shape)
+        parts, mesh = solids_of_shape(kind, shape), mesh_of_shape(kind, shape)
         heights = cut_of(parts, scene)
         if heights is not None:
-            # From above, all that is level has one colour: a map shows a slice.
             cut = (heights[0] if view.elevation >= 89 else -np.inf, heights[1])
             parts = [low for each in parts if (low := _below(each, cut[1])) and low.corners[:, 2].max() >= cut[0]]
-        solids += parts
+        if mesh is None:
+            solids += parts
+            continue
+        cuts = () if heights is None else _cuts(mesh.corners.reshape(-1, 3), view, heights[1])
+        within += [part for part in parts if all((part.corners @ normal).min() < along for normal, along in cuts)]
+        open_below = -np.inf if heights is None or view.elevation < 89 else heights[0]
+        if view.elevation >= 89 and all(_is_passable(part, lower[2], upper[2], has_ceiling) for part in parts):
+            open_below = np.inf
+        meshes.append(dataclasses.replace(mesh, cuts=cuts, open_below=open_below))
     for solid in solids:
         side = boundary_side(solid, lower, upper)
         if side == (2, 1):
@@ -208,7 +201,18 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
     if view.elevation >= 89:
         passable = [solid for solid in shown if _is_passable(solid, lower[2], upper[2], has_ceiling)]
     shown = [solid for solid in shown if not any(solid is each for each in passable)]
-    return CutawayView(shown, near_walls, has_ceiling, moving_solids(scene, 0.0), cut, passable)
+    moving = moving_solids(scene, 0.0)
+    return CutawayView(shown, near_walls, has_ceiling, moving, cut, passable, meshes, within)
+
+
+def _cuts(corners: np.ndarray, view: View, height: float) -> tuple[tuple[np.ndarray, float], ...]:
+    """Returns planes at which a mesh of corners [N, 3] around a flight is cut: above it, and in its near walls."""
+    planes = [(np.array([0.0, 0.0, 1.0]), height)]
+    low, high = corners.min(0), corners.max(0)
+    for axis in (0, 1) if view.elevation < 89 else ():
+        normal = np.sign(view.towards[axis]) * np.eye(3)[axis]
+        planes.append((normal, float(max(low @ normal, high @ normal)) - NEAR_WALL_M))
+    return tuple(planes)
 
 
 def _is_passable(solid: Solid, floor: float, ceiling: float, has_ceiling: bool) -> bool:
@@ -252,20 +256,31 @@ def plot_outlines(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
     axes.add_collection(edges)
 
 
-def plot_solids(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
-    """Draws the solids, the far ones first, each as its faces that look at the eye."""
+def plot_solids(axes: Axes, view: View, solids: Sequence[Solid], meshes: Sequence[Mesh] = ()) -> None:
+    """Draws the solids, the far ones first, each as its faces that look at the eye; or, with meshes, all as these."""
+    if meshes:
+        plot_meshes(axes, view, [*meshes, *(_as_mesh(solid) for solid in solids)])
+        return
     rings, colours = faces_seen(view, solids)
     # Edges in the face's own colour close the hairline between neighbouring faces.
     bodies = PolyCollection(rings, facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=2)
     axes.add_collection(bodies)
 
 
+def _as_mesh(solid: Solid) -> Mesh:
+    """Returns a solid as triangles."""
+    corners = []
+    for face, normal in zip(solid.faces, solid.outward, strict=True):
+        ring = face if _newell(face) @ normal > 0 else face[::-1]
+        corners += [ring[[0, k, k + 1]] for k in range(1, len(ring) - 1)]
+    return Mesh(np.stack(corners), np.asarray(solid.colour))
+
+
 def plot_passable(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
     """Draws solids that leave a way above or below them, pale."""
-    ground = np.array([int(GROUND[i : i + 2], 16) / 255 for i in (1, 3, 5)])
     rings, colours = faces_seen(view, solids)
-    pale = [PALE * colour + (1 - PALE) * ground for colour in colours]
-    axes.add_collection(PolyCollection(rings, facecolors=pale, edgecolors=pale, linewidths=0.3, zorder=1.8))
+    faint = [pale(colour) for colour in colours]
+    axes.add_collection(PolyCollection(rings, facecolors=faint, edgecolors=faint, linewidths=0.3, zorder=1.8))
 
 
 def faces_seen(view: View, solids: Sequence[Solid]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -275,7 +290,7 @@ def faces_seen(view: View, solids: Sequence[Solid]) -> tuple[list[np.ndarray], l
         for face, normal in zip(solid.faces, solid.outward, strict=True):
             if normal @ view.towards > 0:
                 rings.append(view.project(face))
-                colours.append(_shaded(solid.colour, normal))
+                colours.append(shaded(solid.colour, normal))
     return rings, colours
 
 
@@ -361,8 +376,3 @@ def _nearness(solid: Solid, view: View) -> float:
     if view.elevation >= 89:
         return float(solid.corners[:, 2].max())
     return float(middle @ np.array([*view.towards[:2], 0.0]) + 1e-3 * middle[2])
-
-
-def _shaded(colour: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    light = 0.55 + 0.45 * max(float(normal @ SUN), 0.0)
-    return np.clip(colour * light * 1.15, 0.0, 1.0)

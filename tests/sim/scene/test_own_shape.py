@@ -18,7 +18,8 @@ import pytest
 from edqn_jax.config import SHAPES, CameraConfig
 from edqn_jax.evaluation.judge import load_judge, replay_contact
 from edqn_jax.report.page.worlds import world_data
-from edqn_jax.report.worlds.solids import MAP, make_cutaway, plot_solids, solids_of
+from edqn_jax.report.worlds.solids import make_cutaway, plot_solids, solids_of
+from edqn_jax.report.worlds.views import MAP
 from edqn_jax.sim.camera import camera, native
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.distance import path_contact, shape_distances
