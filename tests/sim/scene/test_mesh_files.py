@@ -13,9 +13,11 @@ import pytest
 import trimesh
 
 from edqn_jax.config import Config, WorldConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.runs.world_copy import copy_worlds, with_copied_worlds
 from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.mjcf import SceneError, load_world, mjcf_of
+from edqn_jax.sim.scene.mjcf_parts.assets import load_geometry
 from edqn_jax.sim.scene.mjcf_parts.files import load_checked_text
 
 RING = trimesh.creation.torus(1, 0.3, major_sections=16, minor_sections=8)
@@ -132,6 +134,15 @@ def stl_of(count: int) -> bytes:
     return b"\0" * 80 + struct.pack("<I", count)
 
 
+def ply_of(vertices: list[list[float]], faces: list[list[int]]) -> bytes:
+    """A mesh as a .ply, whatever its triangles name."""
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz")
+    head += f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    places = b"".join(struct.pack("<3f", *vertex) for vertex in vertices)
+    return head.encode() + places + b"".join(struct.pack("<B3i", 3, *face) for face in faces)
+
+
 BAD = {
     "../ring.stl": "which lies outside of the world's folder; copy it there",
     "/etc/hostname": "which lies outside of the world's folder",
@@ -146,6 +157,9 @@ BAD = {
     "nan.obj": "has a vertex that is not finite",
     "points.ply": "has no triangles; `edqn world` makes a world of points",
     "broken.ply": "cannot be read as .ply",
+    "outside.ply": "has a triangle of vertices that it does not have",
+    "before.ply": "has a triangle of vertices that it does not have",
+    "far.obj": r"has a vertex 1e\+30 away; mend it, or scale it",
     "open.stl": "geom 'thing': the mesh is not watertight.*give it a thickness: <numeric",
     "turned.stl": "geom 'thing': the mesh is inside out",
 }
@@ -166,6 +180,10 @@ def test_a_file_that_cannot_be_flown_is_refused_in_one_sentence(tmp_path: Path, 
         large.write(stl_of(10_000_000))
         large.truncate(500_000_084)  # no byte of it is on the disk
     (home / "nan.obj").write_text("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n")
+    (home / "far.obj").write_text("v 0 0 0\nv 1e30 0 0\nv 0 1 0\nf 1 2 3\n")
+    for name_, corner in (("outside", 99_999), ("before", -5)):
+        vertices, faces = RING.vertices.tolist(), [*RING.faces.tolist(), [0, 1, corner]]
+        (home / f"{name_}.ply").write_bytes(ply_of(vertices, faces))
     trimesh.PointCloud(RING.vertices).export(home / "points.ply")
     (home / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n")
     trimesh.Trimesh(RING.vertices, RING.faces[1:]).export(home / "open.stl")
@@ -183,3 +201,72 @@ def test_a_text_with_its_meshes_may_not_be_too_large(tmp_path: Path, monkeypatch
     monkeypatch.setattr("edqn_jax.sim.scene.mjcf_parts.files.MAX_BYTES", 2000)
     with pytest.raises(SceneError, match="with the files that it names; a world may have 2,000"):
         load_world(file)
+
+
+def picture_of(columns: int, rows: int) -> bytes:
+    """The beginning of a .png that says that it is so large."""
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4s2I", 13, b"IHDR", columns, rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("land.png", picture_of(12_000, 10_000), "is of 10000 x 12000; it must be 2 x 2 to 250,000 heights"),
+        ("land.png", picture_of(0, 0), "is of 0 x 0; it must be"),
+        ("land.bin", struct.pack("<2i", 100_000, 100_000), "is of 100000 x 100000; it must be"),
+        ("land.bin", struct.pack("<2i", -4, -4) + bytes(64), "is of -4 x -4; it must be"),
+        ("land.bin", b"", "is of 0 x 0; it must be"),
+        ("land.bin", struct.pack("<2i4f", 2, 2, 0, np.nan, 1, 0), "has a vertex that is not finite"),
+        ("land.bin", struct.pack("<2i3f", 2, 2, 0, 1, 0), "cannot be read: Error: unexpected file size"),
+    ],
+)
+def test_the_file_of_a_height_field_is_refused_by_what_it_says_before_it_is_unpacked(
+    tmp_path: Path, name: str, content: bytes, says: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    asset = f'<hfield name="h" file="{name}" size="8 4 1.5 .5"/>'
+    with pytest.raises(SceneError, match=says) as raised:
+        load_world(world(tmp_path, asset, '<geom name="land" type="hfield" hfield="h" pos="10 5 .5"/>'))
+    assert "\n" not in str(raised.value)
+
+
+def instances(count: int) -> bytes:
+    """A .glb that holds one mesh many times."""
+    scene = trimesh.Scene()
+    for number in range(count):
+        scene.add_geometry(RING, node_name=f"{number}", geom_name="ring")
+    return scene.export(file_type="glb")  # pyright: ignore[reportReturnType]
+
+
+@pytest.mark.parametrize(
+    ("kind", "content"),
+    [
+        ("obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + 1024 * b"f 1 2 3\n"),
+        ("stl", b"solid\n" + 1024 * b"facet\nouter loop\nendloop\nendfacet\n"),
+        ("glb", instances(4)),
+    ],
+)
+def test_triangles_are_counted_before_they_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, content: bytes
+) -> None:
+    assert len(RING.faces) == 256
+    (tmp_path / f"many.{kind}").write_bytes(content)
+    monkeypatch.setattr("trimesh.load", lambda *_, **__: pytest.fail("it is read"))
+    with pytest.raises(ConfigError, match="has 1,024 triangles; it may have 1,023"):
+        load_geometry(tmp_path / f"many.{kind}", kind, 1023)
+
+
+@pytest.mark.parametrize(
+    ("far", "refused"), [("1e7", True), ("-123456789.5", True), ("3E+30", True), ("9999.5", False)]
+)
+def test_a_vertex_in_a_world_may_not_be_so_far_away_that_mujoco_complains(
+    tmp_path: Path, far: str, refused: bool
+) -> None:
+    numbers = f"0.12345678901 0 0  1e-10 1 0  0 0 1  {far} 0 0"
+    asset = f'<mesh name="m" vertex="{numbers}" face="0 2 1 0 1 3 1 2 3 0 3 2"/>'
+    file = world(tmp_path, asset, '<geom type="box" size="1 1 1" pos="9 5 1"/>')
+    if not refused:
+        assert far in load_checked_text(file)
+        return
+    with pytest.raises(SceneError, match=r"<mesh name='m'> with a vertex 1e\+07 or more away; scale it"):
+        load_checked_text(file)

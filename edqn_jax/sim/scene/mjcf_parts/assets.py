@@ -7,6 +7,7 @@ reference and defaults mean what they mean there.
 from __future__ import annotations
 
 import io
+import json
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -27,6 +28,12 @@ MAX_FILE_BYTES = 100_000_000
 
 MOST_BYTES = 1_000_000_000
 """Of a scan, which is read whole."""
+
+MAX_HEIGHTS = 250_000
+"""Of a height field, rows times columns."""
+
+FARTHEST = 1e7
+"""Of a mesh's coordinates, in its own units; beyond it MuJoCo finds no hull."""
 
 _HEADER = 10_000  # bytes that hold the counts of a file
 _STL_BYTES = 50  # of a triangle
@@ -118,6 +125,10 @@ def read_mesh(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     vertices, number = np.unique(np.asarray(found.vertices, np.float64), axis=0, return_inverse=True)
     if not np.all(np.isfinite(vertices)):
         raise ConfigError(f"the mesh file '{file}' has a vertex that is not finite; give it numbers")
+    if np.abs(vertices).max() >= FARTHEST:
+        raise ConfigError(
+            f"the mesh file '{file}' has a vertex {np.abs(vertices).max():.2g} away; mend it, or scale it"
+        )
     return vertices, number.reshape(-1)[faces]
 
 
@@ -137,15 +148,19 @@ def load_geometry(file: Path, kind: str, most: int = MOST_TRIANGLES) -> Any:
             )
         with file.open("rb") as opened:
             check_number(file, _announced(opened.read(_HEADER), kind, size), most)
-        content = io.BytesIO(file.read_bytes())
+        content = file.read_bytes()
     except OSError as error:
         raise ConfigError(f"cannot read the mesh file '{file}': {error.strerror}") from None
+    check_number(file, _counted(content, kind), most)
     try:
-        loaded = trimesh.load(content, file_type=kind, process=False)
-        return loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
+        found: Any = trimesh.load(io.BytesIO(content), file_type=kind, process=False)
+        if isinstance(found, trimesh.Scene):
+            found = found.to_geometry()
     except Exception as error:  # trimesh passes on whatever a file makes its readers raise
         reason = " ".join(str(error).split())[:200]
         raise ConfigError(f"the mesh file '{file}' cannot be read as .{kind}: {reason}") from None
+    _check_corners(file, np.asarray(getattr(found, "faces", ())), len(found.vertices))
+    return found
 
 
 def _load_msh(file: Path) -> Any:
@@ -167,9 +182,14 @@ def _load_msh(file: Path) -> Any:
     check_number(file, faces)
     numbers = np.frombuffer(content[16 : 16 + 12 * vertices], "<f4").reshape(-1, 3)
     rings = np.frombuffer(content[len(content) - 12 * faces :], "<i4").reshape(-1, 3)
-    if len(rings) and not (rings.min() >= 0 and rings.max() < vertices):
-        raise ConfigError(f"the mesh file '{file}' has a triangle of vertices that it does not have")
+    _check_corners(file, rings, vertices)
     return trimesh.Trimesh(numbers, rings, process=False)
+
+
+def _check_corners(file: Path, faces: NDArray[np.integer], vertices: int) -> None:
+    """Raises ConfigError if a triangle of [F, 3] has a corner that is none of so many vertices."""
+    if len(faces) and not (faces.min() >= 0 and faces.max() < vertices):
+        raise ConfigError(f"the mesh file '{file}' has a triangle of vertices that it does not have")
 
 
 def check_number(file: Path, count: int, most: int = MOST_TRIANGLES) -> None:
@@ -191,6 +211,37 @@ def _announced(header: bytes, kind: str, size: int) -> int:
     return int(found[1]) if found else 0
 
 
+def _counted(content: bytes, kind: str) -> int:
+    """Returns how many triangles, at least, are in a file that does not say it at its beginning."""
+    if kind == "obj":
+        return sum(content.count(b"\nf" + blank) for blank in (b" ", b"\t"))
+    if kind == "stl" and content[:5].lower() == b"solid":
+        return max(content.count(b"endfacet"), content.count(b"ENDFACET"))
+    return _counted_in_glb(content) if kind == "glb" else 0
+
+
+def _counted_in_glb(content: bytes) -> int:
+    """Returns how many triangles the nodes of a .glb have together; 0 if it is none."""
+    try:
+        told = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+        counts = [each["count"] for each in told["accessors"]]
+        of_mesh = [
+            sum(counts[part.get("indices", part["attributes"]["POSITION"])] // 3 for part in mesh["primitives"])
+            for mesh in told["meshes"]
+        ]
+        return int(sum(of_mesh[node["mesh"]] for node in told["nodes"] if "mesh" in node))
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError):
+        return 0
+
+
+def _heights_in(content: bytes, kind: str) -> tuple[int, int]:
+    """Returns the rows and columns that the file of a height field says that it has."""
+    if kind == "png":
+        return int.from_bytes(content[20:24], "big"), int.from_bytes(content[16:20], "big")
+    rows, columns = (int.from_bytes(content[i : i + 4], "little", signed=True) for i in (0, 4))
+    return rows, columns
+
+
 def _read_field(file: Path) -> dict[str, str]:
     """Returns rows, columns and heights of a height field's file, as MuJoCo reads it.
 
@@ -200,13 +251,23 @@ def _read_field(file: Path) -> dict[str, str]:
     kind = file.suffix.lower().removeprefix(".")
     if kind not in _FIELD_KINDS:
         raise ConfigError(f"the height field's file '{file}' must end in .png or .bin")
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot read the height field's file '{file}': {error.strerror}") from None
+    rows, columns = _heights_in(content, kind)
+    # Before it is unpacked: a picture of a few bytes may be a large one.
+    if not (min(rows, columns) >= 2 and rows * columns <= MAX_HEIGHTS):
+        raise ConfigError(
+            f"the height field's file '{file}' is of {rows} x {columns}; it must be 2 x 2 to {MAX_HEIGHTS:,} heights"
+        )
     text = (
         f'<mujoco><asset><hfield name="h" file="h.{kind}" size="1 1 1 1"/></asset><worldbody>'
         '<geom type="hfield" hfield="h"/></worldbody></mujoco>'
     )
     try:
-        model = mujoco.MjModel.from_xml_string(text, {f"h.{kind}": file.read_bytes()})
-    except (ValueError, OSError) as error:
+        model = mujoco.MjModel.from_xml_string(text, {f"h.{kind}": content})
+    except ValueError as error:
         reason = " ".join(str(error).split())
         raise ConfigError(f"the height field's file '{file}' cannot be read: {reason}") from None
     rows, columns = int(model.hfield_nrow[0]), int(model.hfield_ncol[0])

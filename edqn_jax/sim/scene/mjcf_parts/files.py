@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import codecs
 import math
+import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.mjcf_parts import xml as mjcf_xml
-from edqn_jax.sim.scene.mjcf_parts.assets import inline_files
+from edqn_jax.sim.scene.mjcf_parts.assets import FARTHEST, MAX_HEIGHTS, inline_files
 from edqn_jax.sim.scene.mjcf_parts.includes import drop_unused, insert_includes
 
 MAX_BYTES = 20_000_000
@@ -26,11 +27,11 @@ MAX_COPIES = 10_000
 MAX_NUMBERS = 4096
 """Of a numeric."""
 
-MAX_HEIGHTS = 200_000
-"""Of a height field, rows times columns."""
-
 MAX_PARAMETER = 100
 """Of a mesh that MuJoCo makes: the number of its triangles grows with the square."""
+
+_FAR = re.compile(r"(?<![\d.])[1-9]\d{7,}|e\+?0*(?:[7-9]|[1-9]\d)", re.IGNORECASE)
+"""In numbers of `FARTHEST` or more, which MuJoCo answers with a page on its standard error."""
 
 FOREIGN = ("model", "attach", "plugin", "extension", "flexcomp", "composite", "skin")
 """Elements that name other files, run other code or make much of little; a static world needs none of them."""
@@ -160,6 +161,9 @@ def _check_elements(tree: ElementTree.Element, path: Path) -> None:
         made = max([0.0, *map(_number, element.get("params", "").split())])
         if element.tag == "mesh" and made > MAX_PARAMETER:
             raise SceneError(f"{path} has <mesh params=...> of more than {MAX_PARAMETER}")
+        if element.tag == "mesh" and _FAR.search(element.get("vertex", "")):
+            name = element.get("name", "")
+            raise SceneError(f"{path} has <mesh name='{name}'> with a vertex {FARTHEST:g} or more away; scale it")
         if element.tag == "hfield" and not element.get("file"):
             rows, columns = _number(element.get("nrow")), _number(element.get("ncol"))
             if not (min(rows, columns) >= 2 and rows * columns <= MAX_HEIGHTS):
