@@ -85,6 +85,22 @@ class Grid:
         digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in content)).digest()
         return cls(content[0], float(cell), half, vertices, np.asarray(faces, np.int64), is_convex, thickness, digest)
 
+    @functools.cached_property
+    def slope(self) -> float:
+        """Returns the largest gradient of the interpolated distance, metres a metre: above 1 where values are lowered.
+
+        A step of the whole distance passes nothing for all that: a distance is bounded by that to the mesh itself, not
+        by its slope to where the interpolated one is 0.
+        """
+        squares = np.zeros(self.values.shape)
+        for axis in range(3):
+            # Within a cell each part of the gradient is linear in x, y and z: the longest is at a corner.
+            steps = np.diff(self.values.astype(np.float64), axis=axis) ** 2
+            after, before = np.zeros((3, 2), int), np.zeros((3, 2), int)
+            after[axis, 1] = before[axis, 0] = 1
+            squares += np.maximum(np.pad(steps, after), np.pad(steps, before))
+        return float(np.sqrt(squares.max())) / self.cell
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Grid) and self.digest == other.digest
 
