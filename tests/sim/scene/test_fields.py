@@ -139,10 +139,12 @@ def test_it_is_drawn_in_figures_and_on_the_page(world: Path) -> None:
     assert [shape["kind"] for shape in world_data(scene)["shapes"]] == ["faces"] * 3
 
 
-def test_a_mesh_of_many_triangles_is_drawn_by_fewer(tmp_path: Path) -> None:
+def test_where_many_triangles_move_fewer_are_drawn_and_on_the_page_all(tmp_path: Path) -> None:
     scene = mjcf.load_scene(mesh_world(tmp_path, '<geom type="mesh" mesh="m" pos="9 5 3"/>', m=ball(300)))
     (solid,) = solids_of(scene)
     assert len(solid.faces) <= 400 and 0.9 < np.linalg.norm(solid.corners - [9, 5, 3], axis=1).min() < 1.01
+    (drawn,) = world_data(scene)["shapes"]
+    assert drawn["kind"] == "mesh" and len(drawn["triangles"]) == len(ball(300)[1]) > 400
 
 
 def test_pools_hold_worlds_with_and_without_meshes_and_with_others(world: Path, tmp_path: Path) -> None:

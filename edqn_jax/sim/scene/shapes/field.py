@@ -307,7 +307,7 @@ def _parts(one: Fields) -> list[list[np.ndarray]]:
 
 def _page(one: Fields) -> dict[str, Any]:
     grid = grid_of(one)
-    if grid.is_convex:
+    if grid.is_convex and len(grid.faces) <= _MOST_FACES:
         return {"kind": "faces", "faces": [ring - one.position for ring in _faces(one)]}
     vertices, faces = thinned(grid.vertices, grid.faces, _MOST_TRIANGLES)
     return {"kind": "mesh", "turn": np.asarray(one.rotation).ravel(), "vertices": vertices, "triangles": faces}
