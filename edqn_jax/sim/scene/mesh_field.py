@@ -89,8 +89,8 @@ class Grid:
     def slope(self) -> float:
         """Returns the largest gradient of the interpolated distance, metres a metre: above 1 where values are lowered.
 
-        A step of the whole distance passes nothing for all that: a distance is bounded by that to the mesh itself, not
-        by its slope to where the interpolated one is 0.
+        A step of the whole distance may pass where the interpolated one is 0, but the mesh itself only by as much as
+        the distance is larger than that to the mesh.
         """
         squares = np.zeros(self.values.shape)
         for axis in range(3):

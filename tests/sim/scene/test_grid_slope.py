@@ -1,4 +1,4 @@
-"""How fast interpolated distances change, and that steps of them pass no mesh."""
+"""How fast interpolated distances change, and that steps of them end before small meshes."""
 
 from __future__ import annotations
 
