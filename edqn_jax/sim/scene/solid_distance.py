@@ -1,8 +1,8 @@
 """Signed distances of closed meshes of any form on the points of a lattice.
 
 Near the surface they are exact, each block of cells against the triangles around it, in one program of JAX on the CPU.
-Further away they are those to the triangle that is the nearest one of the nearest point at the surface, or of a
-neighbour's, less a margin. Inside is where the surface is crossed inwards more often than outwards from below, so that
+Further away they are those to the nearest one of the triangles that are the nearest ones of neighbours closer to the
+surface, less a margin. Inside is where the surface is crossed inwards more often than outwards from below, so that
 solids may overlap.
 
 F triangles of [3, 3] metres; a lattice has `counts` [3] points, `cell` metres apart, about the origin.
@@ -10,6 +10,7 @@ F triangles of [3, 3] metres; a lattice has `counts` [3] points, `cell` metres a
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -27,9 +28,10 @@ EXACT_CELLS = 2.5
 _BLOCK = 4  # cells along each side of a block
 _PIECE_CELLS = 16.0  # longest edge of the pieces that blocks are compared with
 _PARTS = 4  # most parts along each edge of a triangle at whose middles a surface is looked at
-_STEP = 2  # cells to the neighbours whose nearest triangles a point far away is compared with
+_STEP = 2  # cells to the furthest neighbours whose nearest triangles a point far away is compared with
 _FAR_CELLS = 0.1  # that distances further away are too small, for they are not to the nearest of all triangles
 _AT_ONCE = 32  # pieces that a block is compared with in one pass
+_FEW_AT_ONCE, _MOST_AT_ONCE = 2**13, 2**17  # points that are compared with one triangle each: two programs
 _THREADS = 2
 _PAIRS = 2**20  # numbers of an intermediate array
 _BESIDE = (3.1e-5, 1.7e-5)  # of a cell: no line upwards meets an edge of a mesh that is aligned to the lattice
@@ -116,19 +118,57 @@ def solid_distances(
 
 
 def _far_distances(table: Array, nearest: NDArray[np.int32], near: NDArray[np.float32], cell: float) -> Numbers:
-    """Returns the distances of the points of a lattice at which those `near` [X, Y, Z] are infinite."""
+    """Returns the distances of the points of a lattice at which those `near` [X, Y, Z] are infinite.
+
+    Layer by layer away from the surface, a point is compared with the nearest triangles of its neighbours in the layers
+    before and in its own: all that differ of them, which are two or three.
+    """
     far = ~np.isfinite(near)
-    index = distance_transform_edt(~(near < cell), return_distances=False, return_indices=True)
-    nearest = np.pad(nearest[tuple(index)], _STEP, mode="edge")  # type: ignore[index]
     places = np.argwhere(far).astype(np.int32)
-    points = (cell * (places - (np.array(near.shape) - 1) / 2)).astype(np.float32)
-    here, flat = np.ravel_multi_index(tuple(places.T + _STEP), nearest.shape), nearest.reshape(-1)
-    found = np.full(len(places), np.inf, np.float32)
-    for axis in range(3):
-        step = _STEP * nearest.strides[axis] // nearest.itemsize
-        for there in (here - step, here + step, *([here] if axis == 0 else [])):
-            np.minimum(found, _distances_to(table, flat[there], points), out=found)
-    return found
+    layers = np.ceil(distance_transform_edt(far)[far] - 1e-3).astype(np.int32)
+    order = np.argsort(layers, kind="stable")
+    points = (cell * (places[order] - (np.array(near.shape) - 1) / 2)).astype(np.float32)
+    known = np.pad(np.where(far, -1, nearest), _STEP, constant_values=-1).astype(np.int32)
+    here = np.ravel_multi_index(tuple(places[order].T + _STEP), known.shape)
+    apart = [int(offset @ np.array(known.strides) // known.itemsize) for offset in _neighbours()]
+    known, found = known.reshape(-1), np.empty(len(places), np.float32)
+    ends = np.searchsorted(layers[order], np.arange(1, layers.max(initial=0) + 2))
+    for begin, end in itertools.pairwise(ends):
+        rows, numbers = _differing(known, here[begin:end], apart)
+        each = _distances_to(table, numbers, points[begin:end][rows])
+        least = np.full(end - begin, np.inf, np.float32)
+        np.minimum.at(least, rows, each)
+        is_least = each == least[rows]
+        known[here[begin:end][rows[is_least]]] = numbers[is_least]
+        found[begin:end] = least
+    back = np.empty_like(found)
+    back[order] = found
+    return back
+
+
+def _neighbours() -> Integers:
+    """Returns offsets [K, 3] of the neighbours of a point: all around it, and `_STEP` cells away but at corners."""
+    around = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    apart = np.abs(around).sum(1)
+    return np.concatenate([around[apart > 0], _STEP * around[(apart > 0) & (apart < 3)]])
+
+
+def _differing(known: NDArray[np.int32], here: Integers, apart: list[int]) -> tuple[Integers, NDArray[np.int32]]:
+    """Returns the rows [P] of places `here` and the triangles [P] of their neighbours, each that is known once."""
+    of_neighbours = np.stack([known[here + offset] for offset in apart])
+    most = of_neighbours.max(0)
+    least = np.where(of_neighbours < 0, most, of_neighbours).min(0)
+    several = np.flatnonzero(least != most)
+    # Most points have neighbours of one triangle or two: only others are sorted.
+    others = of_neighbours[:, several]
+    others[(others == most[several]) | (others == least[several])] = -1
+    more = np.flatnonzero(others.max(0, initial=-1) >= 0)
+    others = np.sort(others[:, more].T, axis=1)
+    is_new = others >= 0
+    is_new[:, 1:] &= others[:, 1:] != others[:, :-1]
+    row, which = np.nonzero(is_new)
+    rows = np.concatenate([np.arange(len(here)), several, several[more[row]]])
+    return rows, np.concatenate([most, least[several], others[row, which]])
 
 
 def inside_of(triangles: Numbers, axes: list[Numbers]) -> NDArray[np.bool_]:
@@ -281,12 +321,15 @@ def _squares_to(table: Array, numbers: Array, points: Array) -> Array:
 
 def _distances_to(table: Array, numbers: NDArray[np.integer], points: Numbers) -> NDArray[np.float32]:
     """Returns the distance [P] of each point [P, 3] to the triangle of its number, metres."""
-    found = []
-    for i in range(0, len(points), _PAIRS):
-        part = slice(i, i + _PAIRS)
-        given = _padded(numbers[part], 0), _padded(points[part], 0).astype(np.float32)
-        found.append(np.sqrt(np.asarray(_squares_to(table, *given)))[: len(points[part])])
-    return np.concatenate([np.zeros(0, np.float32), *found])
+    found = np.empty(len(points), np.float32)
+    for i in range(0, len(points), _MOST_AT_ONCE):
+        part = slice(i, i + _MOST_AT_ONCE)
+        count = len(points[part])
+        size = _FEW_AT_ONCE if count <= _FEW_AT_ONCE else _MOST_AT_ONCE
+        which, place = np.zeros(size, np.int32), np.zeros((size, 3), np.float32)
+        which[:count], place[:count] = numbers[part], points[part]
+        found[part] = np.sqrt(np.asarray(_squares_to(table, which, place)))[:count]
+    return found
 
 
 def _squares(row: list[Array], place: list[Array]) -> Array:
