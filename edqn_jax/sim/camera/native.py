@@ -2,13 +2,14 @@
 
 Where there is a C compiler, or on GPUs CUDA's, they are drawn by `pictures.c` and `pictures.cu`; everywhere else by the
 same functions in JAX (`columns.py`, `depth.py`). All agree to rounding (`tests/sim/camera/test_native.py`). C knows the
-kinds of shape of `OPERANDS` alone: scenes with any other, one's own included, are drawn in JAX.
+kinds of shape of `OPERANDS` and fields, CUDA the former: scenes with any other, one's own included, are drawn in JAX.
 """
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +22,16 @@ from edqn_jax.sim.camera import raycast
 from edqn_jax.sim.camera.primitive import most_rows
 from edqn_jax.sim.camera.texture import WAVES
 from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.scene.shapes import field_rays
+from edqn_jax.sim.scene.shapes.field import table_for_rays
 from edqn_jax.sim.scene.surface import SURFACE_NUMBERS
 
 SOURCES = {name: Path(__file__).with_name(f"pictures.{name}") for name in ("h", "c", "cu")}
-HEADERS = (SOURCES["h"], *(Path(__file__).with_name(f"{name}.h") for name in ("constants", "patterns", "tilted")))
+HEADERS = (
+    SOURCES["h"],
+    *(Path(__file__).with_name(f"{name}.h") for name in ("constants", "patterns", "tilted", "fields")),
+    *field_rays.HEADERS,
+)
 
 OPERANDS = {
     "boxes": ("position", "half", "yaw", "albedo"),
@@ -33,6 +40,12 @@ OPERANDS = {
     "planes": ("position", "normal", "albedo"),
 }
 """Kinds of shape that the library draws, and what it reads of each. A scene with room for any other is drawn by JAX."""
+
+FIELDS = "fields"
+"""The kind that C draws as well, after the others (`fields.h`), and CUDA does not."""
+
+FIELD_OPERANDS = ("position", "rotation", "half", "grid", "albedo")
+"""What C reads of each field, beside their grids and surfaces."""
 
 MOST_PLANES = 8
 """A scene with more is drawn by JAX."""
@@ -45,15 +58,16 @@ NOWHERE = 1e29
 
 def can_render(scene: Scene, platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing."""
-    shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
-    known = not kinds_for_jax(scene) and all(leaf.dtype == jnp.float32 for leaf in shapes)
+    leaves = [*_shapes(scene), *_leaves(scene.others.get(FIELDS), FIELD_OPERANDS)]
+    known = not kinds_for_jax(scene, platform) and all(leaf.dtype == jnp.float32 for leaf in leaves)
     return known and is_available(platform)
 
 
-def kinds_for_jax(scene: Scene) -> list[str]:
-    """Returns the kinds of shape because of which a scene, or a pool, is drawn by JAX alone; none if C can draw it."""
+def kinds_for_jax(scene: Scene, platform: str = "cpu") -> list[str]:
+    """Returns the kinds of shape because of which JAX draws a scene, or a pool; none if C, or CUDA, can draw it."""
     counts = {kind: shapes.position.shape[-2] for kind, shapes in scene.shapes().items()}
-    most = dict.fromkeys(OPERANDS, math.inf) | {"planes": MOST_PLANES}
+    drawn = (*OPERANDS, FIELDS) if platform == "cpu" else OPERANDS
+    most = dict.fromkeys(drawn, math.inf) | {"planes": MOST_PLANES}
     return [kind for kind, count in counts.items() if count > most.get(kind, 0)]
 
 
@@ -85,12 +99,32 @@ def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Ar
     )
     rays = config.mount == "body", config.samples_across, config.samples_down
     constants = np.array([raycast.pitch_of(config), config.texture_contrast, *rays], np.float32)
-    shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
+    shapes, fields = _shapes(scene), _fields(scene)
     origin, rotation, *weights = frames
-    looks = [_daylight(config, scene), *(_surfaces(scene, kind) for kind in OPERANDS)] if weights else []
-    count = most_rows([*shapes, *frames])
+    looks = [_daylight(config, scene), *(_surfaces(getattr(scene, kind)) for kind in OPERANDS)] if weights else []
+    count = most_rows([*shapes, *_leaves(scene.others.get(FIELDS), FIELD_OPERANDS), *frames])
     shape = jax.ShapeDtypeStruct((count, config.height, config.width), jnp.float32)
-    return jax.ffi.ffi_call(target, shape)(constants, u, v, waves, origin, rotation, *shapes, *looks, *weights)
+    call = jax.ffi.ffi_call(target, shape)
+    return call(constants, u, v, waves, origin, rotation, *shapes, *looks, *weights, *fields)
+
+
+def _leaves(shapes: Any, names: tuple[str, ...]) -> list[Array]:
+    return [] if shapes is None else [getattr(shapes, name) for name in names]
+
+
+def _shapes(scene: Scene) -> list[Array]:
+    return [leaf for kind, names in OPERANDS.items() for leaf in _leaves(getattr(scene, kind), names)]
+
+
+def _fields(scene: Scene) -> list[Array | np.ndarray]:
+    """Returns the operands of fields, those of the enum in `fields.h`; none where there are no fields."""
+    fields = scene.others.get(FIELDS)
+    if fields is None or not fields.position.shape[-2]:
+        return []
+    surfaces = _surfaces(fields)
+    if fields.surface is None:  # blank beside others that have some
+        surfaces = np.zeros((1, fields.position.shape[-2], SURFACE_NUMBERS), np.float32)
+    return [*table_for_rays(fields), *_leaves(fields, FIELD_OPERANDS), surfaces]
 
 
 def _daylight(config: CameraConfig, scene: Scene) -> Array | np.ndarray:
@@ -101,9 +135,9 @@ def _daylight(config: CameraConfig, scene: Scene) -> Array | np.ndarray:
     return jnp.concatenate([light.ambient[:, None], light.sun, light.sky], axis=1)
 
 
-def _surfaces(scene: Scene, kind: str) -> Array | np.ndarray:
-    """Returns the surfaces of a kind [L, N, SURFACE_NUMBERS]; N is 0 where shapes carry the plaid."""
-    surface = getattr(scene, kind).surface
+def _surfaces(shapes: Any) -> Array | np.ndarray:
+    """Returns the surfaces of shapes [L, N, SURFACE_NUMBERS]; N is 0 where they carry the plaid."""
+    surface = shapes.surface
     return np.zeros((1, 0, SURFACE_NUMBERS), np.float32) if surface is None else surface.numbers
 
 

@@ -1,5 +1,6 @@
 /* Pictures and depth images for CPUs, as handlers of XLA's foreign function interface (`native.py` compiles and
- * registers them). What they are made of is in `pictures.h`; those of a camera on the body, in `tilted.h`.
+ * registers them). What they are made of is in `pictures.h`; those of a camera on the body, in `tilted.h`; meshes and the
+ * like, in `fields.h`.
  *
  * A column is drawn at a time, since few shapes cover one, and of its rows LANES at a time, in vectors as GCC and Clang
  * have them for any processor.
@@ -66,6 +67,7 @@ static inline float highest(Lanes x) {
 
 #include "pictures.h"
 #include "tilted.h"
+#include "fields.h"
 
 /* An upright shape that covers the columns [first, last), and its numbers: NUMBERS arrays of `stride`. */
 typedef struct {
@@ -86,6 +88,7 @@ typedef struct {
   float* heights; /* of the tilted ones' faces */
   int *covering, *found; /* shapes that cover each column, in order, and how many */
   int stride, most;
+  Fields fields;
 } Work;
 
 static int rounded_up(int n) { return (n + LANES - 1) / LANES * LANES; }
@@ -98,13 +101,13 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->layers = aligned_alloc(_Alignof(Layers), sizeof(Layers) * (size_t)(rows / LANES));
   w->u = malloc(sizeof(float) * (size_t)(w->stride + 2 * rows));
   w->spheres = malloc(sizeof(Extent) * (size_t)(s->spheres + 1));
-  w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + 1));
+  w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + s->fields + 1));
   w->tilted = malloc(sizeof(Tilted) * (size_t)(uprights + 1));
   w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)(uprights * HEIGHTS(c->across) * w->stride) + 1 : 1));
   w->most = uprights + 1;
   w->found = malloc(sizeof(int) * (size_t)c->width * (size_t)(w->most + 1));
   if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres) return 0;
-  if (!w->patterns || !w->tilted || !w->heights) return 0;
+  if (!w->patterns || !w->tilted || !w->heights || !prepare_fields(c, rows, s->fields, &w->fields)) return 0;
   w->covering = w->found + c->width;
   w->v = w->u + w->stride, w->nearest = w->v + rows;
   /* What lies beyond the image repeats its edge, so that all numbers are finite. */
@@ -115,7 +118,7 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
 
 static void release(Work* w) {
   free(w->numbers), free(w->sides), free(w->layers), free(w->u), free(w->found), free(w->spheres);
-  free(w->patterns), free(w->tilted), free(w->heights);
+  free(w->patterns), free(w->tilted), free(w->heights), free(w->fields.ray[0]);
 }
 
 /* Writes a column of blended layers. */
@@ -152,6 +155,7 @@ static void draw_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w,
     float ahead[3];
     ray_ahead(e, c->u[column], ahead);
     for (int b = 0; b < blocks; ++b) w->layers[b].inserted = 0;
+    insert_fields(c, &w->fields, column, blocks * LANES, s->boxes + s->cylinders + s->spheres + s->planes, w->layers);
     for (int k = 0; k < w->found[column]; ++k) {
       const int n = w->covering[column * w->most + k];
       insert_tilted(c, &w->tilted[n], c->u[column], w->v, w->heights + (size_t)n * of_shape + column, w->stride,
@@ -175,7 +179,8 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
   Plane planes[MOST_PLANES];
   planes_of(c, s, e, planes);
   light_planes(c, s, e, planes);
-  for (int n = 0; n < s->boxes + s->cylinders + s->spheres + s->planes; ++n) w->patterns[n].kind = UNKNOWN;
+  for (int n = 0; n < s->boxes + s->cylinders + s->spheres + s->planes + s->fields; ++n) w->patterns[n].kind = UNKNOWN;
+  draw_fields(c, e, &w->fields, rounded_up(c->height));
   if (c->tilted) {
     draw_tilted(c, s, e, w, waves, planes, picture);
     return;
@@ -206,6 +211,7 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
     float ahead[3];
     ray_ahead(e, u, ahead);
     for (int b = 0; b < blocks; ++b) w->layers[b].inserted = 0;
+    insert_fields(c, &w->fields, column, blocks * LANES, s->boxes + s->cylinders + s->spheres + s->planes, w->layers);
     for (int n = 0; n < s->spheres; ++n) /* A silhouette fades over half a pixel on either side. */
       if (u + 1.5f * c->pitch > w->spheres[n].left && u - 1.5f * c->pitch < w->spheres[n].right)
         for (int b = 0; b < blocks; ++b) insert_sphere(c, s, e, n, ahead, load(w->v + b * LANES), &w->layers[b]);
@@ -303,10 +309,17 @@ static void measure(const Camera* c, const Shapes* s, const Eye* e, Work* w, flo
 
 typedef void Render(const Camera*, const Shapes*, const Eye*, Work*, float*);
 
+static void measure_all(const Camera* c, const Shapes* s, const Eye* e, Work* w, float* picture) {
+  measure(c, s, e, w, picture);
+  measure_fields(c, e, &w->fields, picture);
+}
+
 static XLA_FFI_Error* each_frame(XLA_FFI_CallFrame* call, Render* render, int weighted) {
   if (asked_for_version(call)) return 0;
   Batch batch;
-  XLA_FFI_Error* error = batch_of(call, weighted, &batch);
+  FieldBatch fields;
+  const int first = operands_of(weighted), more = call->args.size == first + FIELD_OPERANDS ? FIELD_OPERANDS : 0;
+  XLA_FFI_Error* error = batch_of(call, weighted, more, &batch);
   if (error || !batch.frames) return error;
   Camera camera;
   Shapes shapes;
@@ -314,6 +327,8 @@ static XLA_FFI_Error* each_frame(XLA_FFI_CallFrame* call, Render* render, int we
   const float* of[OPERANDS];
   memcpy(of, batch.data, sizeof of);
   frame_of(&batch, of, &camera, &shapes, &eye);
+  fields_of(call, first, more, batch.frames, &fields);
+  shapes.fields = fields.count;
   Work work = {0};
   if (!prepare(&camera, &shapes, &work)) {
     release(&work);
@@ -323,6 +338,7 @@ static XLA_FFI_Error* each_frame(XLA_FFI_CallFrame* call, Render* render, int we
   for (uint32_t m = 0; m < batch.frames; ++m) {
     for (int i = ORIGIN; i < OPERANDS; ++i) of[i] = of_frame(&batch, i, m);
     frame_of(&batch, of, &camera, &shapes, &eye);
+    fields_of_frame(&fields, m, &work.fields, &shapes);
     render(&camera, &shapes, &eye, &work, batch.pictures + (int64_t)m * batch.height * batch.width);
   }
   release(&work);
@@ -331,7 +347,7 @@ static XLA_FFI_Error* each_frame(XLA_FFI_CallFrame* call, Render* render, int we
 
 XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call) { return each_frame(call, draw, 1); }
 
-XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call) { return each_frame(call, measure, 0); }
+XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call) { return each_frame(call, measure_all, 0); }
 
 XLA_FFI_Error* edqn_tilted_pictures(XLA_FFI_CallFrame* call) { return edqn_pictures(call); }
 

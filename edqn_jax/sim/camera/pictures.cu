@@ -341,7 +341,7 @@ KERNEL_ON_CPU(measure_tilted)
 #define DRAW(kernel, weighted)                                                                         \
   if (asked_for_version(call)) return 0;                                                               \
   Batch batch;                                                                                         \
-  XLA_FFI_Error* error = batch_of(call, weighted, &batch);                                             \
+  XLA_FFI_Error* error = batch_of(call, weighted, 0, &batch);                                            \
   if (error || !batch.frames) return error;                                                            \
   RETURN_LAUNCHED(kernel, (int64_t)batch.frames*((batch.width + COLUMNS - 1) / COLUMNS), call, batch)
 

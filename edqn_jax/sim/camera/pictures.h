@@ -53,8 +53,10 @@ typedef struct {
   const float *cylinder_position, *cylinder_radius, *cylinder_half, *cylinder_albedo;
   const float *sphere_position, *sphere_radius, *sphere_albedo;
   const float *plane_position, *plane_normal, *plane_albedo;
-  int patterned;                                                       /* whether shapes have surfaces of their own */
+  int patterned; /* whether shapes have surfaces of their own */
   const float *box_surface, *cylinder_surface, *sphere_surface, *plane_surface; /* [SURFACE_NUMBERS] a shape */
+  int fields; /* which `fields.h` draws */
+  const float *field_position, *field_surface;
 } Shapes;
 
 typedef struct {
@@ -403,15 +405,17 @@ FN void textures(const Camera* c, const Wave* waves, const float* ahead, Lanes h
 
 #include "patterns.h"
 
-/* The pattern of shape `n`: boxes, cylinders, spheres, planes. */
+/* The pattern of shape `n`: boxes, cylinders, spheres, planes, fields. */
 FN Pattern pattern_of_shape(const Camera* c, const Shapes* s, const Eye* e, int n) {
-  const int counts[4] = {s->boxes, s->cylinders, s->spheres, s->planes};
-  const float* places[4] = {s->box_position, s->cylinder_position, s->sphere_position, s->plane_position};
-  const float* surfaces[4] = {s->box_surface, s->cylinder_surface, s->sphere_surface, s->plane_surface};
+  const int counts[5] = {s->boxes, s->cylinders, s->spheres, s->planes, s->fields};
+  const float* places[5] = {s->box_position, s->cylinder_position, s->sphere_position, s->plane_position,
+                            s->field_position};
+  const float* surfaces[5] = {s->box_surface, s->cylinder_surface, s->sphere_surface, s->plane_surface,
+                              s->field_surface};
   float right[3], up[3];
   UNROLLED for (int i = 0; i < 3; ++i) right[i] = e->right[i] * c->pitch, up[i] = e->up[i] * c->pitch;
   int kind = 0;
-  while (kind < 3 && n >= counts[kind]) n -= counts[kind++];
+  while (kind < 4 && n >= counts[kind]) n -= counts[kind++];
   return pattern_of(surfaces[kind] + SURFACE_NUMBERS * n, places[kind] + 3 * n, e->origin, right, up, e->up);
 }
 
@@ -665,6 +669,7 @@ FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, E
   s->patterned = b->patterned;
   s->box_surface = of[SURFACES], s->cylinder_surface = of[SURFACES + 1];
   s->sphere_surface = of[SURFACES + 2], s->plane_surface = of[SURFACES + 3];
+  s->fields = 0, s->field_position = s->field_surface = 0;
   e->origin = of[ORIGIN], e->weights = of[WEIGHTS], e->cos = r[0] * scale, e->sin = r[3] * scale;
   e->sky = of[WEIGHTS] ? dot3(c->sky, e->weights) : 0;
   const float forward[3] = {e->cos, e->sin, 0}, right[3] = {e->sin, -e->cos, 0}, up[3] = {0, 0, 1};
@@ -674,10 +679,13 @@ FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, E
   }
 }
 
-/* Reads a call of XLA's into a batch; returns an error for XLA to raise, or 0. Depth images end before LIGHT. */
-static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, Batch* b) {
-  const int operands = weighted ? OPERANDS : LIGHT;
-  if (call->args.size != operands || call->rets.size != 1)
+/* Number of operands of pictures, or of depth images, which end before LIGHT. */
+static inline int operands_of(int weighted) { return weighted ? OPERANDS : LIGHT; }
+
+/* Reads a call of XLA's into a batch; returns an error for XLA to raise, or 0. `more`: operands that the caller reads. */
+static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, int more, Batch* b) {
+  const int operands = operands_of(weighted);
+  if (call->args.size != operands + more || call->rets.size != 1)
     return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
                   "pictures were asked for with a number of operands that the library does not know; native.py must "
                   "give those of the enum in pictures.h");

@@ -8,9 +8,9 @@ mesh, and as the nearest point of the grid together with the distance there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.grid_boxes import boxes_of_grid, thinned
 from edqn_jax.sim.scene.mesh_field import Grid, grid_of_mesh, hull_of, spread_directions
 from edqn_jax.sim.scene.motion import Motion
-from edqn_jax.sim.scene.shapes import field_rays
+from edqn_jax.sim.scene.shapes import field_rays, field_walk
 from edqn_jax.sim.scene.shapes.faces import faces_of_box
 from edqn_jax.sim.scene.shapes.kind import (
     FAR,
@@ -35,9 +35,7 @@ from edqn_jax.sim.scene.shapes.kind import (
     Vector,
     norm,
     offset,
-    per_shape,
     quaternion_of,
-    safe_inverse,
 )
 from edqn_jax.sim.scene.surface import Surface
 
@@ -46,8 +44,6 @@ SLACK_M = 0.1
 
 TOUCHES = 1e-6
 """Metres that are none."""
-
-State = TypeVar("State")
 
 _MOST_FACES = 400  # of a solid in pictures
 _MOST_TRIANGLES = 50_000  # of a mesh on the page
@@ -74,6 +70,7 @@ class _Table(NamedTuple):
     cell: np.ndarray  # [G] metres
     values: np.ndarray  # of all grids, one after the other
     begin: np.ndarray  # [G] number of its first value
+    for_rays: np.ndarray  # the same values in 16 bits (`field_rays.quantized`)
     least: np.ndarray  # of all values in each block of cells
     blocks_begin: np.ndarray  # [G] number of its first block
 
@@ -86,9 +83,16 @@ def _table(grids: tuple[Grid, ...]) -> _Table:
         np.array([grid.cell for grid in grids], np.float32),
         np.concatenate([grid.values.ravel() for grid in grids]),
         np.cumsum([0, *(grid.values.size for grid in grids[:-1])]).astype(np.int32),
+        np.concatenate([field_rays.quantized(grid.values.ravel(), grid.cell) for grid in grids]),
         np.concatenate([least.ravel() for least in blocks]),
         np.cumsum([0, *(least.size for least in blocks[:-1])]).astype(np.int32),
     )
+
+
+def table_for_rays(fields: Fields) -> tuple[np.ndarray, ...]:
+    """Returns what `field_rays.meet` reads of the grids of fields."""
+    table = _table(fields.grids)
+    return table.for_rays, table.begin, table.least, table.blocks_begin, table.counts, table.cell
 
 
 def _least_of_blocks(values: np.ndarray) -> np.ndarray:
@@ -160,102 +164,11 @@ def _meet(fields: Fields, origin: Array, ray: Vector) -> Hits:
     """Returns where rays meet fields: they advance by the distance, within the box around each solid."""
     shape = jnp.broadcast_shapes(*(part.shape for part in ray))
     whole: Any = tuple(jnp.broadcast_to(part, shape)[0] for part in ray)
-    table = _table(fields.grids)
-    natively = partial(
-        field_rays.meet, (table.values, table.begin, table.least, table.blocks_begin, table.counts, table.cell)
-    )
+    table = table_for_rays(fields)
+    natively, plainly = partial(field_rays.meet, table), partial(field_walk.meet, table)
     with_library = {platform: natively for platform in ("cpu", "cuda") if field_rays.is_available(platform)}
-    depth, *normal = lax.platform_dependent(fields, origin, whole, **with_library, default=_meet_in_jax)
+    depth, *normal = lax.platform_dependent(fields, origin, whole, **with_library, default=plainly)
     return Hits.of(depth, depth < field_rays.NOWHERE, (normal[0], normal[1], normal[2]))
-
-
-def _meet_in_jax(fields: Fields, origin: Array, ray: Vector) -> tuple[Array, Array, Array, Array]:
-    """Returns depths [N, R, C] of rays [R, C], `FAR_M` where nothing is met, and three parts of the normal."""
-    shape, number = ray[0].shape, fields.position.shape[0]
-    missing = -ray[0].size % field_rays.TOGETHER
-    groups = [jnp.pad(part.ravel(), (0, missing), mode="edge").reshape(1, -1, field_rays.TOGETHER) for part in ray]
-    turn = [[per_shape(fields.rotation[:, j, i]) for j in range(3)] for i in range(3)]
-    away = [per_shape(origin[i] - fields.position[:, i]) for i in range(3)]
-    o: Any = [sum(turn[i][j] * away[j] for j in range(3)) for i in range(3)]
-    d: Any = [sum(turn[i][j] * groups[j] for j in range(3)) for i in range(3)]
-    cell = per_shape(jnp.asarray(_table(fields.grids).cell)[fields.grid.astype(jnp.int32)])
-    enter, leave = jnp.zeros(()), jnp.full((), field_rays.FAR_M)
-    for i in range(3):
-        per_d = safe_inverse(d[i])
-        middle, reach = -o[i] * per_d, per_shape(fields.half[:, i]) * jnp.abs(per_d)
-        enter, leave = jnp.maximum(enter, middle - reach), jnp.minimum(leave, middle + reach)
-    depth = jnp.maximum(enter, _march_together(fields, o, d, cell, enter, leave))
-    near, per_length = field_rays.STOPS * cell, 1.0 / _length(d)
-
-    def coarse(depth: Array) -> tuple[Array, Array]:
-        room = _least_along(fields, o, d, depth)
-        going = (room >= cell) & (depth < leave) & (enter < leave)
-        return going, jnp.where(going, depth + room * per_length, depth)
-
-    def step(at: tuple[Array, Vector]) -> tuple[Array, tuple[Array, Vector]]:
-        depth, cells = at
-        left, _ = _interpolate(fields, cells)
-        going = (left >= near + field_rays.CONE * depth) & (depth < leave) & (enter < leave)
-        return going, placed(jnp.where(going, depth + left * per_length, depth))
-
-    def placed(depth: Array) -> tuple[Array, Vector]:
-        # Carried along: computed twice, a place may be rounded to either side of where cells meet, and the value of one
-        # cell be read at the share of the other.
-        return depth, _in_cells(fields, (o[0] + depth * d[0], o[1] + depth * d[1], o[2] + depth * d[2]))
-
-    depth, cells = _repeat(step, placed(_repeat(coarse, depth)))
-    _, slopes = _interpolate(fields, cells)
-    hit = (depth > 0) & (depth < leave)
-    scale = safe_inverse(norm(*slopes))
-    normal = [scale * sum(turn[i][j] * slopes[i] for i in range(3)) for j in range(3)]
-    found = (jnp.where(hit, depth, field_rays.FAR_M), *(jnp.where(hit, part, 0.0) for part in normal))
-    x, y, z, w = (part.reshape(number, -1)[:, : ray[0].size].reshape(number, *shape) for part in found)
-    return x, y, z, w
-
-
-def _march_together(fields: Fields, o: Any, d: Any, cell: Array, enter: Array, leave: Array) -> Array:
-    """Returns the depth [N, G, 1] up to which no ray of a group meets anything, of rays `d` [N, G, K] from `o`."""
-    middle = [jnp.mean(part, axis=-1, keepdims=True) for part in d]
-    spread = jnp.max(_length([d[i] - middle[i] for i in range(3)]), axis=-1, keepdims=True)
-    first, last = jnp.min(enter, axis=-1, keepdims=True), jnp.max(leave, axis=-1, keepdims=True)
-    per_length = 1.0 / (_length(middle) + spread)
-
-    def step(depth: Array) -> tuple[Array, Array]:
-        room = _least_along(fields, o, middle, depth) - spread * depth
-        enough = room >= field_rays.WORTH * spread * depth + cell
-        going = enough & (depth < last) & (first < last)
-        return going, jnp.where(going, depth + room * per_length, depth)
-
-    return _repeat(step, first)
-
-
-def _least_along(fields: Fields, o: Any, d: Any, depth: Array) -> Array:
-    """Returns the least distances in the blocks where such rays are."""
-    table, number = _table(fields.grids), per_shape(fields.grid.astype(jnp.int32))
-    counts, cell = jnp.asarray(table.counts)[number], jnp.asarray(table.cell)[number]
-    block = []
-    for i in range(3):
-        last = counts[..., i] - 1
-        at = jnp.clip((o[i] + depth * d[i]) / cell + last / 2, 0.0, last)
-        block.append(jnp.minimum(at.astype(jnp.int32), last - 1) // field_rays.BLOCK)
-    y, z = ((counts[..., i] + field_rays.BLOCK - 2) // field_rays.BLOCK for i in (1, 2))
-    first = jnp.asarray(table.blocks_begin)[number] + block[0] * (y * z) + block[1] * z + block[2]
-    return jnp.asarray(table.least).at[first].get(mode="promise_in_bounds")
-
-
-def _length(vector: Any) -> Array:
-    return jnp.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-
-
-def _repeat(step: Callable[[State], tuple[Array, State]], state: State) -> State:
-    """Returns the state after steps, at most `STEPS`, until none goes on; a step returns which do, and what is next."""
-
-    def more(carry: tuple[Array, State, Array]) -> tuple[Array, State, Array]:
-        going, moved = step(carry[1])
-        return carry[0] + 1, moved, jnp.any(going)
-
-    begin = (jnp.zeros((), jnp.int32), state, jnp.ones((), bool))
-    return lax.while_loop(lambda carry: carry[2] & (carry[0] < field_rays.STEPS), more, begin)[1]
 
 
 def _read(geom: Geom) -> Fields | None:

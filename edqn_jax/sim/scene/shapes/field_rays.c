@@ -3,9 +3,8 @@
  */
 
 #define FN static inline
-#define TOGETHER 8 /* field_rays.py */
 
-#include "field_rays.h"
+#include "field_batch.h"
 
 XLA_FFI_Error* edqn_field_rays(XLA_FFI_CallFrame* call) {
   if (asked_for_version(call)) return 0;

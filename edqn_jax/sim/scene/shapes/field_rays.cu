@@ -6,10 +6,10 @@
 #include "kernel.h"
 
 #define FN static __device__ __forceinline__
-#define TOGETHER 1
+#define WIDE 1
 #define THREADS 128
 
-#include "field_rays.h"
+#include "field_batch.h"
 
 static __global__ void __launch_bounds__(THREADS, 8) meet(const Batch batch) {
   const int64_t i = (int64_t)blockIdx.x * THREADS + threadIdx.x;

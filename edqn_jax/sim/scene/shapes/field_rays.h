@@ -1,268 +1,325 @@
-/* Where rays meet fields, in C for CPUs and in CUDA: `field_rays.c` and `field_rays.cu` include this, `field.py` has
- * the same in JAX.
+/* Where rays meet fields, in C for CPUs and in CUDA: `field_batch.h` and the camera's `fields.h` include this, `field.py`
+ * has the same in JAX.
  *
- * A ray advances by the distance at its end until that is small or the ray has left the box around the solid,
- * neighbours together as far as none of them can meet anything. Whoever includes it says what a function is (FN) and
- * how many rays go TOGETHER.
+ * Neighbouring rays advance together as far as none of them can meet anything. Then each goes from cell to cell: out of
+ * the one where it is, and on by the distance there. Where the distance at either end is small, the ray ends between
+ * them, where it is `STOPS` of a cell and `CONE` of its depth. So where it ends does not depend on where it began.
  */
 
 #ifndef EDQN_FIELD_RAYS_H
 #define EDQN_FIELD_RAYS_H
 
-#include <math.h>
-#include <stdint.h>
+#include "wide.h"
 
-#include "xla/ffi/api/c_api.h"
-#include "handler.h"
-
-#define TINY 1e-9f /* kind.py; the others are of field_rays.py: tests/sim/scene/test_field_rays.py holds them equal */
+#define TINY 1e-9f                /* kind.py; the others are of field_rays.py: tests/sim/scene/test_field_rays.py holds
+                                     them equal */
 #define STEPS 64
 #define STOPS 0.03f
 #define CONE 0.0005f
 #define BLOCK 4
 #define WORTH 0.2f
-#define FAR 1e30f
+#define FINER_STEPS 4
+#define FINER_WORTH 0.1f
+#define FINER_ROOM 0.2f
+#define REFINED 3
+#define PER_CELL 1000.0f
+#define FAR_M 1e30f
 
-/* [.., N, 3] position, [.., N, 3, 3] rotation, [.., N, 3] half, [.., N] grid, [.., 3] origin, [.., P, 3] rays →
- * [.., N, P] depths, FAR where nothing is met, and [.., N, P, 3] normals. */
-enum { VALUES, FIRST, LEAST, FIRST_LEAST, COUNTS, CELL, POSITION, ROTATION, HALF, GRID, ORIGIN, RAYS, OPERANDS };
-enum { DEPTH, NORMAL, RESULTS };
+#if WIDE == 1
+#define TOGETHER 1
+#define AT_ONCE 1
+#else
+#define TOGETHER 16
+#define AT_ONCE 2 /* vectors of rays, which do not wait for each other */
+#endif
+#define CHUNK (TOGETHER * WIDE) /* rays whose groups fill a vector */
 
 typedef struct {
-  const float *values, *least; /* least: in each block of BLOCK cells along each axis */
-  int across, along;           /* values from one place to the next along x and y */
+  const int16_t* values; /* in thousandths of a cell */
+  const float* least;    /* metres, in each block of BLOCK cells along each axis */
+  int across, along;     /* values from one place to the next along x and y */
   int blocks_across, blocks_along;
-  int last[3];
-  float per_cell, cell;
+  float last[3]; /* number of the last value along each axis */
+  float cell, per_cell;
 } Lattice;
 
-/* Rays from one place in a field's own axes, side by side: what is done to all of them becomes vectors. */
+/* A field and the eye, in the field's own axes. */
 typedef struct {
-  float o[3], d[3][TOGETHER], per_length[TOGETHER], enter[TOGETHER], leave[TOGETHER], depth[TOGETHER];
-} Rays;
+  const float* turn;        /* [3, 3] body-to-world */
+  float eye[3], half[3];    /* metres */
+  float from[3];            /* the eye in cells */
+} View;
 
-FN float limited(float x, float most) {
-  x = x > 0.0f ? x : 0.0f;
-  return x < most ? x : most;
+/* Rays side by side, of lengths in cells. */
+typedef struct {
+  Wide d[3], per_d[3], ahead[3]; /* ahead: 1 where it grows along an axis, else 0 */
+  Wide leave, per_value;         /* per_value: depths of a thousandth of a cell */
+} Ray;
+
+/* A cell: its corners, where in it a ray is, and the depth at which that leaves it. */
+typedef struct {
+  Wide corner[8], part[3], rest;
+} Cell;
+
+FN Wide one_over(Wide x) { return 1.0f / choose(size_of(x) < TINY, wide(TINY), x); }
+
+FN Lattice lattice_of(const int16_t* values, const float* least, const int32_t* counts, float cell) {
+  const int y = (counts[1] + BLOCK - 2) / BLOCK, z = (counts[2] + BLOCK - 2) / BLOCK;
+  const Lattice g = {values, least, counts[1] * counts[2], counts[2], y * z, z,
+                     {(float)(counts[0] - 1), (float)(counts[1] - 1), (float)(counts[2] - 1)}, cell, 1.0f / cell};
+  return g;
 }
 
-FN float inverse(float x) { return 1.0f / (fabsf(x) < TINY ? TINY : x); }
-
-/* Where the rays are: the number of a value, or of a block, and the share of a cell. */
-FN void cells_of(const Lattice* g, const Rays* r, int32_t* first, float part[3][TOGETHER]) {
-  for (int l = 0; l < TOGETHER; ++l) first[l] = 0;
+FN View view_of(const Lattice* g, const float* position, const float* turn, const float* half, const float* origin) {
+  View v;
+  const float away[3] = {origin[0] - position[0], origin[1] - position[1], origin[2] - position[2]};
+  v.turn = turn;
   for (int i = 0; i < 3; ++i) {
-    const int32_t stride = i == 0 ? g->across : i == 1 ? g->along : 1;
-    const float last = (float)g->last[i];
-    for (int l = 0; l < TOGETHER; ++l) {
-      const float at = limited((r->o[i] + r->depth[l] * r->d[i][l]) * g->per_cell + 0.5f * last, last);
-      int32_t lower = (int32_t)at;
-      lower = lower < g->last[i] - 1 ? lower : g->last[i] - 1;
-      part[i][l] = at - (float)lower;
-      first[l] += lower * stride;
-    }
+    v.eye[i] = turn[i] * away[0] + turn[3 + i] * away[1] + turn[6 + i] * away[2], v.half[i] = half[i];
+    v.from[i] = v.eye[i] * g->per_cell + 0.5f * g->last[i];
   }
+  return v;
 }
 
-FN void blocks_of(const Lattice* g, const Rays* r, int32_t* block) {
-  for (int l = 0; l < TOGETHER; ++l) block[l] = 0;
+/* Where rays are at a depth, in cells from the first value along axis `i`; a little less than the last. */
+FN Wide along_axis(const Lattice* g, const View* v, int i, Wide d, Wide depth) {
+  return smaller(larger(v->from[i] + depth * d, wide(0)), wide(g->last[i] - 0.001f));
+}
+
+/* The least distances in the blocks where rays are. */
+FN Wide least_around(const Lattice* g, const View* v, const Wide d[3], Wide depth) {
+  const Whole x = floored(along_axis(g, v, 0, d[0], depth)) / BLOCK;
+  const Whole y = floored(along_axis(g, v, 1, d[1], depth)) / BLOCK;
+  const Whole z = floored(along_axis(g, v, 2, d[2], depth)) / BLOCK;
+  return gathered(g->least, x * g->blocks_across + y * g->blocks_along + z);
+}
+
+FN Cell cell_around(const Lattice* g, const View* v, const Ray* r, Wide depth) {
+  const int stride[3] = {g->across, g->along, 1};
+  Cell c;
+  Whole at = whole(0);
+  Wide rest = wide(FAR_M);
   for (int i = 0; i < 3; ++i) {
-    const int32_t stride = i == 0 ? g->blocks_across : i == 1 ? g->blocks_along : 1;
-    const float last = (float)g->last[i];
-    for (int l = 0; l < TOGETHER; ++l) {
-      const float at = limited((r->o[i] + r->depth[l] * r->d[i][l]) * g->per_cell + 0.5f * last, last);
-      const int32_t lower = (int32_t)at;
-      block[l] += (int32_t)((uint32_t)(lower < g->last[i] - 1 ? lower : g->last[i] - 1) / BLOCK) * stride;
-    }
+    const Wide x = along_axis(g, v, i, r->d[i], depth);
+    const Whole lower = floored(x);
+    c.part[i] = x - as_wide(lower), at += lower * stride[i];
+    rest = smaller(rest, (r->ahead[i] - c.part[i]) * r->per_d[i]);
   }
+  c.rest = larger(rest, wide(0));
+  gathered_pair(g->values, at, &c.corner[0], &c.corner[1]);
+  gathered_pair(g->values, at + g->along, &c.corner[2], &c.corner[3]);
+  gathered_pair(g->values, at + g->across, &c.corner[4], &c.corner[5]);
+  gathered_pair(g->values, at + (g->across + g->along), &c.corner[6], &c.corner[7]);
+  return c;
 }
 
-/* The distances between the values of the lattice, and their slopes per cell where they are asked for. */
-FN void interpolate(const Lattice* g, const Rays* r, float* found, float slope[3][TOGETHER]) {
-  int32_t first[TOGETHER];
-  float part[3][TOGETHER], corner[8][TOGETHER];
-  cells_of(g, r, first, part);
-  for (int l = 0; l < TOGETHER; ++l) {
-    const float *v = g->values + first[l], *w = v + g->along, *x = v + g->across, *y = x + g->along;
-    corner[0][l] = v[0], corner[1][l] = v[1], corner[2][l] = w[0], corner[3][l] = w[1];
-    corner[4][l] = x[0], corner[5][l] = x[1], corner[6][l] = y[0], corner[7][l] = y[1];
-  }
-  for (int l = 0; l < TOGETHER; ++l) {
-    const float dz00 = corner[1][l] - corner[0][l], dz01 = corner[3][l] - corner[2][l];
-    const float dz10 = corner[5][l] - corner[4][l], dz11 = corner[7][l] - corner[6][l];
-    const float z00 = corner[0][l] + part[2][l] * dz00, z01 = corner[2][l] + part[2][l] * dz01;
-    const float z10 = corner[4][l] + part[2][l] * dz10, z11 = corner[6][l] + part[2][l] * dz11;
-    const float y0 = z00 + part[1][l] * (z01 - z00), y1 = z10 + part[1][l] * (z11 - z10);
-    found[l] = y0 + part[0][l] * (y1 - y0);
-    if (slope) {
-      const float s0 = dz00 + part[1][l] * (dz01 - dz00), s1 = dz10 + part[1][l] * (dz11 - dz10);
-      slope[0][l] = y1 - y0;
-      slope[1][l] = (z01 - z00) + part[0][l] * ((z11 - z10) - (z01 - z00));
-      slope[2][l] = s0 + part[0][l] * (s1 - s0);
-    }
-  }
+FN Wide mixed(Wide low, Wide high, Wide part) { return low + part * (high - low); }
+
+/* The distance in a cell, `further` than where the ray is, in thousandths of a cell. */
+FN Wide distance_in(const Cell* c, const Ray* r, Wide further) {
+  const Wide *k = c->corner, x = c->part[0] + further * r->d[0], y = c->part[1] + further * r->d[1];
+  const Wide z = c->part[2] + further * r->d[2];
+  const Wide y0 = mixed(mixed(k[0], k[1], z), mixed(k[2], k[3], z), y);
+  const Wide y1 = mixed(mixed(k[4], k[5], z), mixed(k[6], k[7], z), y);
+  return mixed(y0, y1, x);
 }
 
-FN float length(float x, float y, float z) { return sqrtf(x * x + y * y + z * z); }
+/* The same, and its slopes per cell. */
+FN Wide slopes_in(const Cell* c, const Ray* r, Wide further, Wide slope[3]) {
+  const Wide *k = c->corner, x = c->part[0] + further * r->d[0], y = c->part[1] + further * r->d[1];
+  const Wide z = c->part[2] + further * r->d[2];
+  const Wide z00 = mixed(k[0], k[1], z), z01 = mixed(k[2], k[3], z);
+  const Wide z10 = mixed(k[4], k[5], z), z11 = mixed(k[6], k[7], z);
+  const Wide y0 = mixed(z00, z01, y), y1 = mixed(z10, z11, y);
+  slope[0] = y1 - y0, slope[1] = mixed(z01 - z00, z11 - z10, x);
+  slope[2] = mixed(mixed(k[1] - k[0], k[3] - k[2], y), mixed(k[5] - k[4], k[7] - k[6], y), x);
+  return mixed(y0, y1, x);
+}
 
-/* The depth up to which nothing is met by rays about their middle, by the least distances of blocks. */
-FN float march_together(const Lattice* g, const Rays* r, float first, float last) {
-  float d[3] = {0.0f, 0.0f, 0.0f}, spread = 0.0f, depth = first;
-  for (int i = 0; i < 3; ++i)
-    for (int l = 0; l < TOGETHER; ++l) d[i] += r->d[i][l] * (1.0f / TOGETHER);
-  for (int l = 0; l < TOGETHER; ++l) {
-    const float wide = length(r->d[0][l] - d[0], r->d[1][l] - d[1], r->d[2][l] - d[2]);
-    spread = wide > spread ? wide : spread;
-  }
-  const float per_length = 1.0f / (length(d[0], d[1], d[2]) + spread);
-  for (int step = 0; step < STEPS && depth < last; ++step) {
-    int32_t at[3];
+/* The distance at which a ray ends, in thousandths of a cell. */
+FN Wide end_at(const Lattice* g, Wide depth) { return PER_CELL * STOPS + PER_CELL * CONE * g->per_cell * depth; }
+
+/* Rays of a chunk: metres in the field's own axes, and the depths at which they enter and leave the box around it. */
+typedef struct {
+  float d[3][CHUNK], enter[CHUNK], leave[CHUNK];
+  float middle[3][WIDE], spread[WIDE], first[WIDE], last[WIDE]; /* of groups */
+} Chunk;
+
+/* Reads `count` rays; what is beyond repeats the last. */
+FN void read_rays(const View* v, const float* const rays[3], int64_t count, Chunk* c) {
+  const float* t = v->turn;
+  for (int b = 0; b < CHUNK; b += WIDE) {
+    Wide ray[3], enter = wide(0), leave = wide(FAR_M);
     for (int i = 0; i < 3; ++i) {
-      const float last_value = (float)g->last[i];
-      const int32_t lower = (int32_t)limited((r->o[i] + depth * d[i]) * g->per_cell + 0.5f * last_value, last_value);
-      at[i] = (int32_t)((uint32_t)(lower < g->last[i] - 1 ? lower : g->last[i] - 1) / BLOCK);
+      float edge[WIDE];
+      if (b + WIDE > count)
+        for (int l = 0; l < WIDE; ++l) edge[l] = rays[i][b + l < count ? b + l : count - 1];
+      ray[i] = wide_at(b + WIDE > count ? edge : rays[i] + b);
     }
-    const float room = g->least[at[0] * g->blocks_across + at[1] * g->blocks_along + at[2]] - spread * depth;
-    if (room < WORTH * spread * depth + g->cell) break;
-    depth += room * per_length;
+    for (int i = 0; i < 3; ++i) {
+      const Wide d = t[i] * ray[0] + t[3 + i] * ray[1] + t[6 + i] * ray[2], per = one_over(d);
+      const Wide middle = -v->eye[i] * per, reach = v->half[i] * size_of(per);
+      keep(c->d[i] + b, d), enter = larger(enter, middle - reach), leave = smaller(leave, middle + reach);
+    }
+    keep(c->enter + b, enter), keep(c->leave + b, leave);
   }
+}
+
+/* Sets what groups of TOGETHER rays share: a direction, how far others are from it, where they enter and leave. */
+FN void group_rays(Chunk* c) {
+  for (int n = 0; n < WIDE; ++n) {
+    float low[3], high[3], first = FAR_M, last = 0.0f;
+    for (int i = 0; i < 3; ++i) {
+      const float* d = c->d[i] + n * TOGETHER;
+      low[i] = high[i] = d[0];
+      for (int k = 0; k < TOGETHER; ++k) low[i] = d[k] < low[i] ? d[k] : low[i], high[i] = d[k] > high[i] ? d[k] : high[i];
+      c->middle[i][n] = 0.5f * (low[i] + high[i]), high[i] = 0.5f * (high[i] - low[i]);
+    }
+    const float *enter = c->enter + n * TOGETHER, *leave = c->leave + n * TOGETHER;
+    for (int k = 0; k < TOGETHER; ++k) {
+      first = enter[k] < first ? enter[k] : first, last = leave[k] > last ? leave[k] : last;
+    }
+    c->spread[n] = sqrtf(high[0] * high[0] + high[1] * high[1] + high[2] * high[2]);
+    c->first[n] = first, c->last[n] = last;
+  }
+}
+
+/* The depths up to which groups of rays meet nothing. */
+FN Wide march_together(const Lattice* g, const View* v, const Chunk* c) {
+  const Wide spread = wide_at(c->spread), last = wide_at(c->last);
+  Wide d[3] = {wide_at(c->middle[0]), wide_at(c->middle[1]), wide_at(c->middle[2])}, depth = wide_at(c->first);
+  const Wide per_metre = 1.0f / (root(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]) + spread);
+  for (int i = 0; i < 3; ++i) d[i] *= g->per_cell;
+  Whole going = depth < last;
+  for (int step = 0; step < STEPS && any(going); ++step) {
+    const Wide room = least_around(g, v, d, depth) - spread * depth;
+    going &= (room >= WORTH * spread * depth + g->cell) & (depth < last);
+    depth += choose(going, room * per_metre, wide(0));
+  }
+#if TOGETHER > 1
+  const Ray r = {{d[0], d[1], d[2]}, {wide(0), wide(0), wide(0)}, {wide(0), wide(0), wide(0)}, last, wide(0)};
+  going = depth < last;
+  for (int step = 0; step < FINER_STEPS && any(going); ++step) {
+    const Cell here = cell_around(g, v, &r, depth);
+    const Wide room = distance_in(&here, &r, wide(0)) * (g->cell / PER_CELL) - spread * depth;
+    going &= (room >= FINER_WORTH * spread * depth + FINER_ROOM * g->cell) & (depth < last);
+    depth += choose(going, room * per_metre, wide(0));
+  }
+#endif
   return depth;
 }
 
-/* Advances each of the rays to the surface, by the least distances of blocks, and then by those in between. */
-FN void march(const Lattice* g, Rays* r) {
-  float left[TOGETHER];
-  int32_t block[TOGETHER], going = 1;
-  for (int step = 0; step < STEPS && going; ++step) {
-    blocks_of(g, r, block);
-    for (int l = 0; l < TOGETHER; ++l) left[l] = g->least[block[l]];
-    going = 0;
-    for (int l = 0; l < TOGETHER; ++l) {
-      const int32_t on = (left[l] >= g->cell) & (r->depth[l] < r->leave[l]) & (r->enter[l] < r->leave[l]);
-      r->depth[l] += on ? left[l] * r->per_length[l] : 0.0f;
-      going |= on;
+/* A vector of rays on its way. */
+typedef struct {
+  Ray ray;
+  Wide depth, stride; /* stride: what the last step went on by the distance at the end of a cell */
+  Whole going;
+  int number, steps;
+} Walk;
+
+FN Walk walk_from(const Lattice* g, const Chunk* c, const float* start, int number) {
+  const int b = number * WIDE;
+  const Wide d[3] = {wide_at(c->d[0] + b), wide_at(c->d[1] + b), wide_at(c->d[2] + b)};
+  const Wide enter = wide_at(c->enter + b), per_cell = wide(g->per_cell);
+  Walk w;
+  for (int i = 0; i < 3; ++i) {
+    w.ray.d[i] = d[i] * per_cell, w.ray.per_d[i] = one_over(d[i]) * g->cell;
+    w.ray.ahead[i] = choose(d[i] > -TINY, wide(1), wide(0));
+  }
+  w.ray.leave = wide_at(c->leave + b);
+  w.ray.per_value = (g->cell / PER_CELL) / root(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+#if TOGETHER % WIDE == 0
+  w.depth = larger(wide(start[b / TOGETHER]), enter);
+#else
+  float each[WIDE];
+  for (int l = 0; l < WIDE; ++l) each[l] = start[(b + l) / TOGETHER];
+  w.depth = larger(wide_at(each), enter);
+#endif
+  w.going = (enter < w.ray.leave) & (w.depth < w.ray.leave), w.number = number, w.steps = 0;
+  w.stride = wide(0);
+  return w;
+}
+
+/* Takes a step; returns whether any of the rays goes on. */
+FN int step_on(const Lattice* g, const View* v, Walk* w) {
+  const Cell c = cell_around(g, v, &w->ray, w->depth);
+  const Wide here = distance_in(&c, &w->ray, wide(0)), there = distance_in(&c, &w->ray, c.rest);
+  w->going &= (here > end_at(g, w->depth)) & (there > end_at(g, w->depth + c.rest));
+  w->stride = choose(w->going, there * w->ray.per_value, w->stride);
+  w->depth += choose(w->going, c.rest + w->stride, wide(0));
+  w->going &= w->depth < w->ray.leave;
+  return any(w->going) && ++w->steps < STEPS;
+}
+
+/* Sets where rays end in their last cell: depths, FAR_M where nothing is met, and normals in the world. */
+FN void end_walk(const Lattice* g, const View* v, const Walk* w, Wide* depth, Wide normal[3]) {
+  const Ray* r = &w->ray;
+  const Cell c = cell_around(g, v, r, w->depth);
+  const Wide here = distance_in(&c, r, wide(0)) - end_at(g, w->depth);
+  const Wide there = distance_in(&c, r, c.rest) - end_at(g, w->depth + c.rest);
+  const Whole within = (here > 0.0f) & (there <= 0.0f), beyond = here <= 0.0f; /* the last step was too long */
+  Wide further = choose(within, c.rest * here / choose(within, here - there, wide(1)), wide(0)), slope[3];
+  for (int k = 0; k < REFINED; ++k) {
+    const Wide left = slopes_in(&c, r, further, slope) - end_at(g, w->depth + further);
+    const Wide fall = slope[0] * r->d[0] + slope[1] * r->d[1] + slope[2] * r->d[2] - PER_CELL * CONE * g->per_cell;
+    if (k + 1 < REFINED) {
+      const Wide next = further - left / smaller(fall, wide(-TINY));
+      further = choose(within, smaller(larger(next, wide(0)), c.rest), further);
+      further = choose(beyond & (fall < 0.0f), smaller(larger(next, -w->stride), wide(0)), further);
     }
   }
-  going = 1;
-  for (int step = 0; step < STEPS && going; ++step) {
-    interpolate(g, r, left, 0);
-    going = 0;
-    for (int l = 0; l < TOGETHER; ++l) {
-      const int32_t on = (left[l] >= STOPS * g->cell + CONE * r->depth[l]) & (r->depth[l] < r->leave[l]) &
-                         (r->enter[l] < r->leave[l]);
-      r->depth[l] += on ? left[l] * r->per_length[l] : 0.0f;
-      going |= on;
-    }
+  const Wide end = w->depth + further, *s = slope;
+  const Whole hit = (end > 0.0f) & (end < r->leave);
+  const float* t = v->turn;
+  const Wide scale = choose(hit, one_over(root(s[0] * s[0] + s[1] * s[1] + s[2] * s[2])), wide(0));
+  *depth = choose(hit, end, wide(FAR_M));
+  for (int i = 0; i < 3; ++i) normal[i] = scale * (t[3 * i] * s[0] + t[3 * i + 1] * s[1] + t[3 * i + 2] * s[2]);
+}
+
+/* Writes where a vector of rays ended, of which `count` are left. */
+FN void write_ends(const Lattice* g, const View* v, const Walk* w, int64_t count, float* depth, float* const normal[3]) {
+  Wide end, along[3];
+  const int b = w->number * WIDE;
+  end_walk(g, v, w, &end, along);
+  if (b + WIDE <= count) {
+    keep(depth + b, end);
+    for (int i = 0; i < 3; ++i) keep(normal[i] + b, along[i]);
+    return;
+  }
+  float each[4][WIDE];
+  keep(each[0], end), keep(each[1], along[0]), keep(each[2], along[1]), keep(each[3], along[2]);
+  for (int l = 0; b + l < count; ++l) {
+    depth[b + l] = each[0][l];
+    for (int i = 0; i < 3; ++i) normal[i][b + l] = each[1 + i][l];
   }
 }
 
-/* Rays [count, 3] from `origin` and one field, turned by `t`: depths [count] and normals [count, 3]. */
-FN void draw(const Lattice* g, const float* position, const float* t, const float* half, const float* origin,
-             const float* rays, int64_t count, float* depths, float* normals) {
-  float away[3];
-  Rays r;
-  for (int i = 0; i < 3; ++i) away[i] = origin[i] - position[i];
-  for (int i = 0; i < 3; ++i) r.o[i] = t[i] * away[0] + t[3 + i] * away[1] + t[6 + i] * away[2];
-  for (int64_t begin = 0; begin < count; begin += TOGETHER) {
-    float ray[3][TOGETHER], left[TOGETHER], slope[3][TOGETHER], first = FAR, last = 0.0f;
-    for (int l = 0; l < TOGETHER; ++l) {
-      const float* one = rays + 3 * (begin + l < count ? begin + l : count - 1);
-      ray[0][l] = one[0], ray[1][l] = one[1], ray[2][l] = one[2], r.enter[l] = 0.0f, r.leave[l] = FAR;
-    }
-    for (int i = 0; i < 3; ++i) {
-      for (int l = 0; l < TOGETHER; ++l) {
-        r.d[i][l] = t[i] * ray[0][l] + t[3 + i] * ray[1][l] + t[6 + i] * ray[2][l];
-        const float per = inverse(r.d[i][l]), centre = -r.o[i] * per, reach = half[i] * fabsf(per);
-        r.enter[l] = centre - reach > r.enter[l] ? centre - reach : r.enter[l];
-        r.leave[l] = centre + reach < r.leave[l] ? centre + reach : r.leave[l];
+/* Writes where `count` rays meet a field: depths [count], FAR_M where nothing is met, and three parts of normals. */
+FN void trace(const Lattice* g, const View* v, const float* const rays[3], int64_t count, float* depth,
+              float* const normal[3]) {
+  for (int64_t begin = 0; begin < count; begin += CHUNK) {
+    const float* const from[3] = {rays[0] + begin, rays[1] + begin, rays[2] + begin};
+    float* const to[3] = {normal[0] + begin, normal[1] + begin, normal[2] + begin};
+    const int64_t left = count - begin < CHUNK ? count - begin : CHUNK;
+    const int vectors = (int)((left + WIDE - 1) / WIDE);
+    Chunk c;
+    float start[WIDE];
+    Walk walk[AT_ONCE];
+    int next = 0, walking = 0;
+    read_rays(v, from, left, &c);
+    group_rays(&c);
+    keep(start, march_together(g, v, &c));
+    while (walking < AT_ONCE && next < vectors) walk[walking++] = walk_from(g, &c, start, next++);
+    while (walking)
+      for (int n = 0; n < walking; ++n) {
+        if (step_on(g, v, &walk[n])) continue;
+        write_ends(g, v, &walk[n], left, depth + begin, to);
+        if (next < vectors)
+          walk[n] = walk_from(g, &c, start, next++);
+        else
+          walk[n--] = walk[--walking];
       }
-    }
-    for (int l = 0; l < TOGETHER; ++l) {
-      r.per_length[l] = 1.0f / length(r.d[0][l], r.d[1][l], r.d[2][l]);
-      first = r.enter[l] < first ? r.enter[l] : first, last = r.leave[l] > last ? r.leave[l] : last;
-    }
-    const float free = first < last ? march_together(g, &r, first, last) : first;
-    for (int l = 0; l < TOGETHER; ++l) r.depth[l] = free > r.enter[l] ? free : r.enter[l];
-    if (first < last) march(g, &r);
-    interpolate(g, &r, left, slope);
-    for (int l = 0; l < TOGETHER && begin + l < count; ++l) {
-      float* normal = normals + 3 * (begin + l);
-      const int hit = (r.depth[l] > 0.0f) & (r.depth[l] < r.leave[l]);
-      const float scale = hit ? inverse(length(slope[0][l], slope[1][l], slope[2][l])) : 0.0f;
-      depths[begin + l] = hit ? r.depth[l] : FAR;
-      for (int j = 0; j < 3; ++j)
-        normal[j] = scale * (t[3 * j] * slope[0][l] + t[3 * j + 1] * slope[1][l] + t[3 * j + 2] * slope[2][l]);
-    }
   }
-}
-
-#define MOST_AXES 8 /* that are mapped */
-
-/* An operand, and how far apart its rows are along each leading axis of the results: 0 where there is one for all. */
-typedef struct {
-  const float* data;
-  int64_t apart[MOST_AXES];
-} Operand;
-
-/* All fields that one call draws: `rows` times `fields`, `count` rays each. */
-typedef struct {
-  Operand of[OPERANDS];
-  int64_t axes[MOST_AXES], leading, rows, fields, count;
-  const float *values, *least, *cells;
-  const int32_t *counts, *starts, *blocks;
-  float *depth, *normal;
-} Batch;
-
-/* Reads what a call is of. */
-static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, Batch* batch) {
-  if (call->args.size != OPERANDS || call->rets.size != RESULTS)
-    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "the operands of fields are not those of field_rays.py");
-  const XLA_FFI_Buffer* depth = (const XLA_FFI_Buffer*)call->rets.rets[DEPTH];
-  const int64_t leading = depth->rank - 2;
-  if (leading > MOST_AXES)
-    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "rays through fields are mapped too often");
-  const void* data[OPERANDS];
-  batch->leading = leading, batch->fields = depth->dims[leading], batch->count = depth->dims[leading + 1];
-  batch->rows = 1;
-  for (int64_t i = 0; i < leading; ++i) batch->rows *= batch->axes[i] = depth->dims[i];
-  for (int k = 0; k < OPERANDS; ++k) {
-    const XLA_FFI_Buffer* b = (const XLA_FFI_Buffer*)call->args.args[k];
-    data[k] = b->data;
-    if (k < POSITION) continue;
-    int64_t size = 1;
-    for (int64_t i = leading; i < b->rank; ++i) size *= b->dims[i];
-    for (int64_t i = leading - 1; i >= 0; --i) {
-      batch->of[k].apart[i] = b->dims[i] == 1 ? 0 : size;
-      size *= b->dims[i];
-    }
-    batch->of[k].data = (const float*)b->data;
-  }
-  batch->values = (const float*)data[VALUES], batch->least = (const float*)data[LEAST];
-  batch->cells = (const float*)data[CELL], batch->counts = (const int32_t*)data[COUNTS];
-  batch->starts = (const int32_t*)data[FIRST], batch->blocks = (const int32_t*)data[FIRST_LEAST];
-  batch->depth = (float*)depth->data;
-  batch->normal = (float*)((const XLA_FFI_Buffer*)call->rets.rets[NORMAL])->data;
-  return 0;
-}
-
-/* Draws rays `begin` to `end` of field n in row m. */
-FN void draw_some(const Batch* b, uint32_t m, int64_t n, int64_t begin, int64_t end) {
-  const float* of[OPERANDS];
-  const int64_t at = ((int64_t)m * b->fields + n) * b->count + begin;
-  for (int k = POSITION; k < OPERANDS; ++k) of[k] = b->of[k].data;
-  for (int i = (int)b->leading - 1; i >= 0; --i) {
-    const uint32_t here = m % (uint32_t)b->axes[i];
-    m /= (uint32_t)b->axes[i];
-    for (int k = POSITION; k < OPERANDS; ++k) of[k] += here * b->of[k].apart[i];
-  }
-  const int grid = (int)of[GRID][n];
-  const int32_t* c = b->counts + 3 * grid;
-  const float cell = b->cells[grid];
-  const int y = (c[1] + BLOCK - 2) / BLOCK, z = (c[2] + BLOCK - 2) / BLOCK;
-  const Lattice g = {b->values + b->starts[grid], b->least + b->blocks[grid], c[1] * c[2], c[2], y * z, z,
-                     {c[0] - 1, c[1] - 1, c[2] - 1}, 1.0f / cell, cell};
-  draw(&g, of[POSITION] + 3 * n, of[ROTATION] + 9 * n, of[HALF] + 3 * n, of[ORIGIN], of[RAYS] + 3 * begin, end - begin,
-       b->depth + at, b->normal + 3 * at);
 }
 
 #endif
