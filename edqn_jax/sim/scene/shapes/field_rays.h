@@ -14,8 +14,8 @@
 #define TINY 1e-9f                /* kind.py; the others are of field_rays.py: tests/sim/scene/test_field_rays.py holds
                                      them equal */
 #define STEPS 64
-#define STOPS 0.03f
-#define CONE 0.0005f
+#define STOPS 0.002f
+#define CONE 0.00002f
 #define BLOCK 4
 #define WORTH 0.2f
 #define FINER_STEPS 4

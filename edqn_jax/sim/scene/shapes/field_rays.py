@@ -16,7 +16,7 @@ from edqn_jax.sim.scene.shapes.kind import Vector
 STEPS = 64
 """Most steps of a ray, each out of a cell and on by the distance there: along a wall they are short."""
 
-STOPS, CONE = 0.03, 0.0005
+STOPS, CONE = 0.002, 0.00002
 """Shares of a cell and of a depth: a ray so near to a surface has met it. So has one that has used up its steps, which
 runs along a surface."""
 
