@@ -173,7 +173,10 @@ def _add_space(table: Table, found: WorldCheck, policy: str) -> None:
 
 def _add_cost(table: Table, cost: Cost) -> None:
     """Adds what a world takes."""
-    by = "C, on GPUs CUDA" if not cost.drawn_by_jax else f"JAX, because of its {_words(*cost.drawn_by_jax)}"
+    by = f"JAX, because of its {_words(*cost.drawn_by_jax)}" if cost.drawn_by_jax else "C"
+    if not cost.drawn_by_jax:
+        kinds = cost.drawn_by_jax_on_gpus
+        by += f", on GPUs JAX, because of its {_words(*kinds)}" if kinds else ", on GPUs CUDA"
     _add_row(table, "pictures are drawn by", f"{by}; about {_rounded(cost.picture_us)} µs each on two CPU cores")
     _add_row(table, "training", f"some {_rounded(cost.decisions_per_s)} decisions/s on two CPU cores")
     _add_row(

@@ -19,7 +19,7 @@ from edqn_jax.planning.path import point_text
 from edqn_jax.planning.widest import WidestWay, find_widest_way, is_roomy
 from edqn_jax.policies.sizes import describe_larger, sorted_sides
 from edqn_jax.policies.unseen import describe_unseen
-from edqn_jax.sim.camera.native import kinds_for_jax
+from edqn_jax.sim.camera.native import FIELDS, kinds_for_jax
 from edqn_jax.sim.scene.distance import distances_to_shapes
 from edqn_jax.sim.scene.mjcf import LoadedWorld, SceneError, check_scene, check_volume, load_world, resolve_world
 from edqn_jax.sim.scene.scene import Scene, scene_shapes
@@ -37,13 +37,13 @@ where doors were 1.4 m wide, 48 % of 1.7 m, 64 % of 2 m and 78 % of 2.6 m."""
 _PICTURE_US = {"c": 4.0, "jax": 45.0}
 """Microseconds of a picture of 32 x 24 pixels on two cores of a server without shapes, as measured."""
 
-_SHAPE_US = {"c": 0.1, "jax": 20.0, "fields": 1200.0}
-"""What each shape adds: drawn in C; by JAX; a field, by JAX along rays that C follows, on a core."""
+_SHAPE_US = {"c": 0.1, "jax": 20.0, "fields": 120.0, "fields_by_jax": 320.0}
+"""What each shape adds: drawn in C; by JAX; a field that fills the picture, in C; by JAX along rays that C follows."""
 
 _REST_US = 21.0
 """Of a decision of training on two cores but for its two pictures: some 34,000 a second (docs/performance.md)."""
 
-_SHAPE_BYTES = {"jax": 4.4, "fields": 9.6}
+_SHAPE_BYTES = {"jax": 4.4, "fields_by_jax": 9.6}
 """Bytes of a pixel that JAX holds for each shape while it draws a batch, as measured."""
 
 _COPIES = 2
@@ -55,7 +55,9 @@ class Cost:
     """What a world takes, estimated."""
 
     drawn_by_jax: list[str]
-    """Kinds of shape because of which pictures are drawn by JAX alone; empty if C or CUDA draws them."""
+    """Kinds of shape because of which pictures are drawn by JAX alone; empty if C draws them."""
+    drawn_by_jax_on_gpus: list[str]
+    """The same on GPUs; empty if CUDA draws them."""
     picture_us: float
     """Microseconds of a picture on two CPU cores."""
     decisions_per_s: float
@@ -249,9 +251,11 @@ def estimate_cost(config: Config, scene: Scene) -> Cost:
     by_jax = kinds_for_jax(scene)
     pixels = config.camera.width * config.camera.height
     counts = {kind: shapes.position.shape[-2] for kind, shapes in scene.shapes().items()}
-    rows = {kind: ("jax" if by_jax else "c") if kind != "fields" else kind for kind in counts}
+    rows = dict.fromkeys(counts, "jax" if by_jax else "c")
     if by_jax:  # upright ones are drawn in columns, as cheap as in C beside others
         rows |= {kind: "c" for kind in counts if kind not in by_jax}
+    if FIELDS in counts:
+        rows[FIELDS] = "fields_by_jax" if by_jax else "fields"
     each = sum(_SHAPE_US[rows[kind]] * count for kind, count in counts.items())
     held = sum(_SHAPE_BYTES.get(rows[kind], 0.0) * count for kind, count in counts.items())
     world = bytes_of(scene)
@@ -261,6 +265,7 @@ def estimate_cost(config: Config, scene: Scene) -> Cost:
     picture_us = (_PICTURE_US["jax" if by_jax else "c"] + each) * pixels / (32 * 24)
     return Cost(
         drawn_by_jax=by_jax,
+        drawn_by_jax_on_gpus=kinds_for_jax(scene, "cuda"),
         picture_us=picture_us,
         decisions_per_s=1e6 / (len(config.events.frame_times_s) * picture_us + _REST_US),
         world_bytes=world + grids,

@@ -109,13 +109,13 @@ def test_each_geom_is_said_to_have_become_a_shape_or_why_not(tmp_path: Path) -> 
     ]
 
 
-def test_a_mesh_becomes_a_field_that_only_jax_draws(tmp_path: Path) -> None:
+def test_a_mesh_becomes_a_field_that_c_draws_and_cuda_does_not(tmp_path: Path) -> None:
     file = mesh_world(tmp_path, '<geom name="block" type="mesh" mesh="cube" pos="10 2 2"/>', cube=hull(CUBE))
     found = check_world(ROOMS, str(file))
     assert found.survey is not None and found.cost is not None and found.refusal is None
     assert [fate.became for fate in found.survey.geoms] == ["planes", "fields"]
-    assert found.cost.drawn_by_jax == ["fields"]
-    assert [warning for warning in found.warnings if "alone do not draw the fields" in warning] == list(found.warnings)
+    assert found.cost.drawn_by_jax == [] and found.cost.drawn_by_jax_on_gpus == ["fields"]
+    assert not found.warnings
     plain = check_world(ROOMS, str(corridor(tmp_path, WIDE))).cost
     assert plain is not None and plain.drawn_by_jax == [] and found.cost.picture_us > 10 * plain.picture_us
     assert 20_000 < plain.decisions_per_s < 35_000 and found.cost.decisions_per_s < plain.decisions_per_s / 2

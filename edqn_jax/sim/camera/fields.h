@@ -45,6 +45,7 @@ typedef struct {
   const FieldBatch* batch;
   float *ray[3], *depth, *normal[3];
   float* layer[4]; /* closeness, coverage, value, slope: rows of a column, columns, fields */
+  int* seen;       /* whether a field may be seen, by field: otherwise its layers hold nothing */
 } Fields;
 
 /* Reads `more` operands of a call, those of fields or none, from `first` on. */
@@ -80,18 +81,19 @@ static int prepare_fields(const Camera* c, int rows, int count, Fields* f) {
   if (!count) return 1;
   const size_t drawn = (size_t)c->width * c->height * (c->across * c->down);
   const size_t rays = (drawn + WIDE - 1) / WIDE * WIDE, pixels = (size_t)c->width * rows * count;
-  float* memory = malloc(sizeof(float) * (7 * rays + 4 * pixels));
+  float* memory = malloc(sizeof(float) * (7 * rays + 4 * pixels) + sizeof(int) * (size_t)count);
   f->ray[0] = memory;
   if (!memory) return 0;
   f->ray[1] = memory + rays, f->ray[2] = memory + 2 * rays, f->depth = memory + 3 * rays;
   for (int i = 0; i < 3; ++i) f->normal[i] = memory + (4 + i) * rays;
   for (int i = 0; i < 4; ++i) f->layer[i] = memory + 7 * rays + i * pixels;
-  memset(f->layer[0], 0, sizeof(float) * 4 * pixels);
+  memset(f->layer[0], 0, sizeof(float) * 4 * pixels); /* also rows beyond the image, which nothing writes */
+  f->seen = (int*)(memory + 7 * rays + 4 * pixels);
   return 1;
 }
 
 /* Sets the rays of a frame: `across` x `down` of each pixel. */
-static void rays_of_frame(const Camera* c, const Eye* e, int across, int down, Fields* f) {
+static void rays_of_frame(const Camera* c, const Eye* e, int across, int down, const Fields* f) {
   int64_t n = 0;
   for (int column = 0; column < c->width; ++column)
     for (int row = 0; row < c->height; ++row)
@@ -104,15 +106,15 @@ static void rays_of_frame(const Camera* c, const Eye* e, int across, int down, F
       }
 }
 
-/* Traces the rays of a frame to field `n`. */
-static void trace_field(const Eye* e, const Fields* f, int n, int64_t rays) {
+/* Traces the rays of a frame to field `n`; returns whether any comes near it. */
+static int trace_field(const Eye* e, const Fields* f, int n, int64_t rays) {
   const FieldBatch* b = f->batch;
   const int grid = (int)f->grid[n];
   const Lattice g = lattice_of((const int16_t*)b->data[VALUES] + ((const int32_t*)b->data[FIRST_VALUE])[grid],
                                (const float*)b->data[LEAST] + ((const int32_t*)b->data[FIRST_LEAST])[grid],
                                (const int32_t*)b->data[COUNTS] + 3 * grid, ((const float*)b->data[CELL])[grid]);
   const View v = view_of(&g, f->position + 3 * n, f->rotation + 9 * n, f->half + 3 * n, e->origin);
-  trace(&g, &v, (const float* const*)f->ray, rays, f->depth, f->normal);
+  return trace(&g, &v, (const float* const*)f->ray, rays, f->depth, f->normal);
 }
 
 /* Turns depths and normals of rays into what pixels add up: closeness, brightness, slope, and which were met. */
@@ -154,7 +156,8 @@ static void draw_fields(const Camera* c, const Eye* e, const Fields* f, int rows
   const int64_t rays = (int64_t)c->width * c->height * c->across * c->down;
   if (f->count) rays_of_frame(c, e, c->across, c->down, f);
   for (int n = 0; n < f->count; ++n) {
-    trace_field(e, f, n, rays);
+    f->seen[n] = trace_field(e, f, n, rays);
+    if (!f->seen[n]) continue;
     shade_rays(c, e, f, rays);
     layers_of_field(c, e, f, n, rows);
   }
@@ -163,7 +166,7 @@ static void draw_fields(const Camera* c, const Eye* e, const Fields* f, int rows
 /* Adds the fields to the layers of the rows of a column, in blocks of LANES; `first`: number of the first of them. */
 static void insert_fields(const Camera* c, const Fields* f, int column, int rows, int first, Layers* layers) {
   for (int n = 0; n < f->count; ++n)
-    for (int row = 0; row < rows; row += LANES) {
+    for (int row = 0; f->seen[n] && row < rows; row += LANES) {
       const size_t at = ((size_t)n * c->width + column) * rows + row;
       const Lanes coverage = load(f->layer[1] + at);
       if (!any_of(coverage > 0)) continue;
@@ -177,7 +180,7 @@ static void insert_fields(const Camera* c, const Fields* f, int column, int rows
 static void measure_fields(const Camera* c, const Eye* e, const Fields* f, float* picture) {
   if (f->count) rays_of_frame(c, e, 1, 1, f);
   for (int n = 0; n < f->count; ++n) {
-    trace_field(e, f, n, (int64_t)c->width * c->height);
+    if (!trace_field(e, f, n, (int64_t)c->width * c->height)) continue;
     for (int column = 0; column < c->width; ++column)
       for (int row = 0; row < c->height; ++row) {
         float* nearest = picture + row * c->width + column;

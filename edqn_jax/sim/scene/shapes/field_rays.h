@@ -145,9 +145,10 @@ typedef struct {
   float middle[3][WIDE], spread[WIDE], first[WIDE], last[WIDE]; /* of groups */
 } Chunk;
 
-/* Reads `count` rays; what is beyond repeats the last. */
-FN void read_rays(const View* v, const float* const rays[3], int64_t count, Chunk* c) {
+/* Reads `count` rays; what is beyond repeats the last. Returns whether any of them enters the box. */
+FN int read_rays(const View* v, const float* const rays[3], int64_t count, Chunk* c) {
   const float* t = v->turn;
+  Whole entered = whole(0);
   for (int b = 0; b < CHUNK; b += WIDE) {
     Wide ray[3], enter = wide(0), leave = wide(FAR_M);
     for (int i = 0; i < 3; ++i) {
@@ -161,8 +162,9 @@ FN void read_rays(const View* v, const float* const rays[3], int64_t count, Chun
       const Wide middle = -v->eye[i] * per, reach = v->half[i] * size_of(per);
       keep(c->d[i] + b, d), enter = larger(enter, middle - reach), leave = smaller(leave, middle + reach);
     }
-    keep(c->enter + b, enter), keep(c->leave + b, leave);
+    keep(c->enter + b, enter), keep(c->leave + b, leave), entered |= enter < leave;
   }
+  return any(entered);
 }
 
 /* Sets what groups of TOGETHER rays share: a direction, how far others are from it, where they enter and leave. */
@@ -294,9 +296,11 @@ FN void write_ends(const Lattice* g, const View* v, const Walk* w, int64_t count
   }
 }
 
-/* Writes where `count` rays meet a field: depths [count], FAR_M where nothing is met, and three parts of normals. */
-FN void trace(const Lattice* g, const View* v, const float* const rays[3], int64_t count, float* depth,
-              float* const normal[3]) {
+/* Writes where `count` rays meet a field: depths [count], FAR_M where nothing is met, and three parts of normals. Returns
+ * whether any enters the box around it. */
+FN int trace(const Lattice* g, const View* v, const float* const rays[3], int64_t count, float* depth,
+             float* const normal[3]) {
+  int entered = 0;
   for (int64_t begin = 0; begin < count; begin += CHUNK) {
     const float* const from[3] = {rays[0] + begin, rays[1] + begin, rays[2] + begin};
     float* const to[3] = {normal[0] + begin, normal[1] + begin, normal[2] + begin};
@@ -306,7 +310,11 @@ FN void trace(const Lattice* g, const View* v, const float* const rays[3], int64
     float start[WIDE];
     Walk walk[AT_ONCE];
     int next = 0, walking = 0;
-    read_rays(v, from, left, &c);
+    if (!read_rays(v, from, left, &c)) {
+      for (int64_t k = 0; k < left; ++k) depth[begin + k] = FAR_M, to[0][k] = to[1][k] = to[2][k] = 0.0f;
+      continue;
+    }
+    entered = 1;
     group_rays(&c);
     keep(start, march_together(g, v, &c));
     while (walking < AT_ONCE && next < vectors) walk[walking++] = walk_from(g, &c, start, next++);
@@ -320,6 +328,7 @@ FN void trace(const Lattice* g, const View* v, const float* const rays[3], int64
           walk[n--] = walk[--walking];
       }
   }
+  return entered;
 }
 
 #endif
