@@ -48,7 +48,8 @@ def poses(seed: int) -> tuple[jax.Array, jax.Array]:
     """Places in the volume, inside of shapes as well, and turns of drones that lean."""
     rng = np.random.default_rng(seed)
     place = rng.uniform([2, 2, 0.5], [15, 8, 5], (COUNT, 3))
-    turn = [rotation_of(*rng.uniform(-0.4, 0.4, 2), yaw) for yaw in rng.uniform(-np.pi, np.pi, COUNT)]
+    leans = rng.uniform(-0.4, 0.4, (COUNT, 2))
+    turn = [rotation_of(a, b, yaw) for (a, b), yaw in zip(leans, rng.uniform(-np.pi, np.pi, COUNT), strict=True)]
     return jnp.asarray(place, jnp.float32), jnp.asarray(np.stack(turn), jnp.float32)
 
 

@@ -90,7 +90,7 @@ def _table(grids: tuple[Grid, ...]) -> _Table:
 
 
 def table_for_rays(fields: Fields) -> tuple[np.ndarray, ...]:
-    """Returns what `field_rays.meet` reads of the grids of fields."""
+    """Returns what `field_rays.meet` reads of the G grids of fields: its `table`, of values [...] and rows [G, ...]."""
     table = _table(fields.grids)
     return table.for_rays, table.begin, table.least, table.blocks_begin, table.counts, table.cell
 

@@ -75,6 +75,6 @@ def meet(table: tuple[np.ndarray, ...], fields: Any, origin: Array, ray: Vector)
 
 
 def quantized(values: np.ndarray, cell: float) -> np.ndarray:
-    """Returns distances, metres, in units of `PER_CELL` to a cell: int16, those further away as the furthest."""
+    """Returns distances [...], metres, in units of `PER_CELL` to a cell: int16 [...], further ones as the furthest."""
     most = np.iinfo(np.int16).max
     return np.clip(np.rint(values * (PER_CELL / cell)), -most, most).astype(np.int16)
