@@ -135,7 +135,7 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
         begins = apply_layer(begins, {"events": {"profile": profile}}, "the command line")
     if helped:
         show_train_help(TrainOptions(), begins, SHORT_NAMES, everything=everything)
-    config = _with_world_paths(_parse_config(argv, begins))
+    config = _with_whole_paths(_parse_config(argv, begins))
     validate(config)
     check_learns(config)
     if run is not None and folder is not None:
@@ -169,12 +169,15 @@ def _names_defaults(argv: Sequence[str]) -> bool:
     return any(word.partition("=")[0] in ("--preset", "--config", "--tuned-for", "--tuned_for") for word in argv)
 
 
-def _with_world_paths(config: Config) -> Config:
-    """Returns the configuration with whole paths of its worlds' files."""
+def _with_whole_paths(config: Config) -> Config:
+    """Returns the configuration with whole paths of its worlds' files and its teacher's folder."""
     world = dataclasses.replace(
         config.world, name=_find_world(config.world.name), flown=_find_world(config.world.flown)
     )
-    return dataclasses.replace(config, world=world)
+    teacher = config.imitation.teacher
+    if teacher and Path(teacher).is_dir():
+        teacher = str(Path(teacher).resolve())
+    return dataclasses.replace(config, world=world, imitation=dataclasses.replace(config.imitation, teacher=teacher))
 
 
 def _find_world(world: str) -> str:

@@ -169,6 +169,21 @@ class PqnConfig:
 
 
 @dataclass(frozen=True)
+class ImitationConfig:
+    """Imitation, `agent.learner imitation` (DAgger, Ross et al. 2011). It also reads network, step sizes, updates and
+    replay of `agent`.
+    """
+
+    teacher: str = ""
+    """Policy that is imitated: the folder of a run that was trained with `env.sensor depth`, and with the same camera,
+    commands and own state."""
+    teacher_moves: Annotated[float, SHARE] = 1.0
+    """beta: share of the moves that the teacher takes at first; the others are the student's."""
+    teacher_fraction: Annotated[float, SHARE] = 0.1
+    """Share of the training after the warm-up over which `teacher_moves` falls linearly to 0."""
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """The training run."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 
-from edqn_jax.config.learning import AgentConfig, EncoderConfig, PqnConfig, TrainConfig
+from edqn_jax.config.learning import AgentConfig, EncoderConfig, ImitationConfig, PqnConfig, TrainConfig
 from edqn_jax.config.simulation import (
     AirConfig,
     BodyConfig,
@@ -45,6 +45,7 @@ class Config:
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     pqn: PqnConfig = field(default_factory=PqnConfig)
+    imitation: ImitationConfig = field(default_factory=ImitationConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
 

@@ -24,8 +24,16 @@ __all__ = [
 LEARNERS = Registry(
     "learner",
     "agent.learner",
-    {"dqn": "edqn_jax.learn.dqn.learner:DQN", "pqn": "edqn_jax.learn.pqn.learner:PQN"},
-    {"dqn": "from a replay", "pqn": "from fresh rollouts (options `pqn.*`)"},
+    {
+        "dqn": "edqn_jax.learn.dqn.learner:DQN",
+        "pqn": "edqn_jax.learn.pqn.learner:PQN",
+        "imitation": "edqn_jax.runs.teacher:IMITATION",
+    },
+    {
+        "dqn": "from a replay",
+        "pqn": "from fresh rollouts (options `pqn.*`)",
+        "imitation": "from the moves of a policy that sees depth (options `imitation.*`)",
+    },
     take=instance_of("an edqn_jax.learn.learner.Learner", "edqn_jax.learn.learner:Learner"),
 )
 """How the network that chooses moves learns: `edqn_jax.learn.learner.Learner`."""

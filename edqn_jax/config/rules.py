@@ -31,7 +31,7 @@ def validate(config: Config, *, trains: bool = True) -> None:
     _check_world(config, trains)
     for registry in (SENSORS, AIRFRAMES, ENCODERS, LEARNERS, NETWORKS, ACTION_SETS):
         registry.check(_value(config, registry.option))
-    for rules in (_flight_rules(config, trains), _training_rules(config, trains), _learning_rules(config)):
+    for rules in (_flight_rules(config, trains), _training_rules(config, trains), _learning_rules(config, trains)):
         for holds, name, limit in rules:
             require(holds, name, limit, _value(config, name))
 
@@ -151,11 +151,15 @@ def _event_sensor_rules(events: EventsConfig) -> Rules:
     yield one, "events.sensor_pixels", "1 with events.law airsim, which has no pixels that differ"
 
 
-def _learning_rules(config: Config) -> Rules:
+def _learning_rules(config: Config, trains: bool) -> Rules:
     """Yields rules of what learns, and of what it learns from."""
     encoder, agent, envs = config.encoder, config.agent, config.train.num_envs
     leans = not encoder.levelled or (config.camera.mount == "body" and config.env.sensor == "events")
     yield leans, "encoder.levelled", "false unless camera.mount is body and env.sensor is events"
+    if agent.learner == "imitation" and trains:
+        limit = "the folder of a run with env.sensor depth, for agent.learner imitation"
+        yield bool(config.imitation.teacher), "imitation.teacher", limit
+        yield not encoder.levelled, "encoder.levelled", "false with agent.learner imitation"
     warmed = not encoder.retrain_at or encoder.warmup_decisions > 0
     yield warmed, "encoder.warmup_decisions", "at least 1 where encoder.retrain_at is given"
     falls = agent.exploration_end <= agent.exploration_start

@@ -61,6 +61,15 @@ class Exploration(NamedTuple):
     total: int  # decisions that it will have
     episodes: Array  # [S, E] that each environment has finished since then
 
+    advice: Array | None = None  # [S, E] moves of the teacher here; None without one
+
+
+class Teacher(NamedTuple):
+    """A policy that advises a learner in training."""
+
+    config: Config
+    params: Params
+
 
 class Rings(NamedTuple):
     """Inputs of an update."""
@@ -125,6 +134,9 @@ class Learner:
     begin_from: Callable[[Config, State, Params], State] | None = None
     """(config, state that has learnt nothing, parameters that fly) → state that begins with them; None if it never
     does."""
+    teacher: Callable[[Config], Teacher] | None = None
+    """(config) → a policy of the sensor `depth`, whose greedy moves are stored in every row (`Rows.advice`), and given
+    to `act` in the exploration; None if it has none. Called where programs are traced."""
 
     def __post_init__(self) -> None:
         """Checks what each function takes.
@@ -132,11 +144,11 @@ class Learner:
         Raises:
             ConfigError: names the function and its arguments.
         """
-        begins = {} if self.begin_from is None else {"begin_from": "config, state, params"}
         check_functions(
             self,
             {
-                **begins,
+                "begin_from": "config, state, params",
+                "teacher": "config",
                 "init": "config, key",
                 "act": "config, state, memory, keys, exploration",
                 "decide": "config, params, memory",

@@ -34,6 +34,7 @@ class Rows:
     outcome: Array  # [E] int8, `Outcome` on arriving here
     is_reset: Array  # [E] bool, a new episode begins here
     action: Array  # [E] int8, taken here
+    advice: Array | None = None  # [E] int8, move of the learner's teacher here; None without one
 
 
 @struct.dataclass
@@ -46,16 +47,18 @@ class Batch:
     discount: Array  # [B] gamma^m for the bootstrap, 0 after a terminal outcome
     next_history: Array  # [B, H, D] observations up to where the bootstrap is taken
     weight: Array  # [B] 1 for a sample, 0 for a row that starts nothing (an episode's last) or led to a divergence
+    advice: Array | None = None  # [B] int32, as in `Rows`
 
 
-def empty_ring(length: int, envs: int, observation_size: int) -> Rows:
-    """Returns a ring of `length` decisions of the `envs` environments of one shard."""
+def empty_ring(length: int, envs: int, observation_size: int, *, advised: bool = False) -> Rows:
+    """Returns a ring of `length` decisions of the `envs` environments of one shard, with advice if `advised`."""
     return Rows(
         observation=jnp.zeros((length, envs, observation_size)),
         reward=jnp.zeros((length, envs)),
         outcome=jnp.zeros((length, envs), jnp.int8),
         is_reset=jnp.zeros((length, envs), bool),
         action=jnp.zeros((length, envs), jnp.int8),
+        advice=jnp.zeros((length, envs), jnp.int8) if advised else None,
     )
 
 
@@ -139,4 +142,5 @@ def _transition(config: AgentConfig, ring: Rows, start: Array, env: Array) -> Ba
         weight=((outcomes[h - 1] == Outcome.RUNNING) & (outcomes[h + steps - 1] != Outcome.DIVERGED)).astype(
             jnp.float32
         ),
+        advice=None if ring.advice is None else ring.advice[at[h - 1], env].astype(jnp.int32),
     )

@@ -17,6 +17,7 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.learn import replay, samples
 from edqn_jax.learn.actor import AgentActor, observation_size
+from edqn_jax.learn.imitation.advice import Advice, no_advice
 from edqn_jax.learn.learner import Metrics, learner_of
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.samples import Samples
@@ -44,6 +45,7 @@ class Actors:
     replay: replay.Rows  # [S, L, E, ...]
     samples: Samples | None  # [S, L, E, ...] what the VAE learns from; None where there is none
     key: Array  # [S] typed keys of the shards
+    advice: Advice | None = None  # [S, E, ...] of the learner's teacher; None without one
 
 
 @struct.dataclass
@@ -116,7 +118,10 @@ def init_state(config: Config, env_params: EnvParams, key: Array) -> TrainState:
     task = task_of(config)
     state = task.map(lambda k: task.begin(env_params, k, None))(keys.environments)
     networks, memory = init_networks(config, keys.learner), AgentActor(config).init()
-    ring = replay.empty_ring(learner_of(config).ring_length(config), envs // shards, observation_size(config))
+    learner = learner_of(config)
+    ring = replay.empty_ring(
+        learner.ring_length(config), envs // shards, observation_size(config), advised=learner.teacher is not None
+    )
     whole = Actors(
         env=state,
         memory=jnp.broadcast_to(memory, (envs, *memory.shape)),
@@ -128,6 +133,7 @@ def init_state(config: Config, env_params: EnvParams, key: Array) -> TrainState:
         replay=jnp.zeros(envs),  # type: ignore[arg-type]
         samples=None,
         key=jnp.zeros(envs),
+        advice=None if learner.teacher is None else no_advice(learner.teacher(config).config, envs),
     )
     actors = jax.tree.map(lambda x: x.reshape(shards, envs // shards, *x.shape[1:]), whole).replace(
         replay=jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring),

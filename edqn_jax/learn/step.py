@@ -19,6 +19,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn import replay, samples
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.checked import one_by_one
+from edqn_jax.learn.imitation.advice import Advice, advise
 from edqn_jax.learn.learner import Exploration, Metrics, Rings, learner_of
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.samples import Samples
@@ -66,7 +67,8 @@ def train_step(
     action, held_move, acted = _act(config, networks, actors, keys, jnp.maximum(step - schedule.warmup, 0), in_warmup)
     ring = _store(actors, action, time)
     env_state, timestep = _fly(config, env_params, actors, action)
-    rings = _store_samples(config, env_params, actors, env_state, timestep, step)
+    near = None if actors.advice is None else _nearness(config, env_params, env_state)
+    rings = _store_samples(config, env_params, actors, env_state, timestep, step, near)
     params_nonfinite = ~is_finite((networks.vae, networks.encoder, learner_of(config).network(networks.agent)))
     of_vae, networks = update_vae(config, axis, networks, rings, keys.vae, step)
     last = of_vae.metrics["reconstruction_loss"]
@@ -86,6 +88,7 @@ def train_step(
         replay=ring,
         samples=rings,
         key=keys.next,
+        advice=shaped(_advise(config, networks, actors, timestep, near)),
     )
     episodes = Episodes(
         outcome=outcome, length=shaped(timestep.episode_length), episode_return=shaped(timestep.episode_return)
@@ -124,6 +127,8 @@ def _act(
     """
     schedule, envs = Schedule.from_config(config), config.train.num_envs
     progress = Exploration(time * envs, (schedule.scheduled - schedule.warmup) * envs, actors.episodes)
+    if actors.advice is not None:
+        progress = progress._replace(advice=actors.advice.move)
     chosen, metrics = learner_of(config).act(config, networks.agent, actors.memory, keys.act, progress)
     held_move = jax.vmap(partial(_held_moves, config))(actors.manoeuvre, keys.held_move)
     return jnp.where(in_warmup, held_move, chosen), held_move, metrics
@@ -137,6 +142,7 @@ def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
         outcome=actors.outcome,
         is_reset=actors.is_reset,
         action=action,
+        advice=None if actors.advice is None else actors.advice.move,
     )
     return jax.vmap(replay.store_decision, in_axes=(0, 0, None))(actors.replay, rows, time)
 
@@ -153,6 +159,25 @@ def _encode_observations(config: Config, networks: Networks, actors: Actors, tim
     forget = timestep.is_reset | Schedule.from_config(config).replaces_encoder(step)
     memory = jnp.where(forget[:, None, None], 0.0, merge_shards(actors.memory))
     return AgentActor(config).encode(_acting(config, networks), memory, timestep.observation)
+
+
+def _nearness(config: Config, env_params: EnvParams, env_state: EnvState) -> Array:
+    """Returns how near things are from every environment [S * E, H, W], a label for training."""
+    task = task_of(config)
+    assert task.label is not None
+    return task.map(partial(task.label, env_params))(env_state)
+
+
+def _advise(config: Config, networks: Networks, actors: Actors, timestep: Step, near: Array | None) -> Advice | None:
+    """Returns the advice [S * E, ...] of the learner's teacher for new observations; None without one."""
+    teacher = learner_of(config).teacher
+    if teacher is None:
+        return None
+    assert near is not None
+    before = jax.tree.map(merge_shards, actors.advice)
+    return advise(
+        config, teacher(config).config, networks.teacher, before, timestep.observation, timestep.is_reset, near
+    )
 
 
 def _by_shard(shape: tuple[int, ...], tree: Any) -> Any:
@@ -179,11 +204,17 @@ def _refresh_acting_encoder(config: Config, networks: Networks, step: Array) -> 
 
 
 def _store_samples(
-    config: Config, env_params: EnvParams, actors: Actors, env_state: EnvState, timestep: Step, step: Array
+    config: Config,
+    env_params: EnvParams,
+    actors: Actors,
+    env_state: EnvState,
+    timestep: Step,
+    step: Array,
+    near: Array | None = None,
 ) -> Samples | None:
     """Returns the VAE's rings [S, L, E, ...], with this step's observations [S * E, ...] if the VAE learns in it.
 
-    Only then are labels rendered. None where there is no VAE.
+    Only then are labels rendered, unless they are there already: `near` [S * E, H, W]. None where there is no VAE.
     """
     if actors.samples is None:
         return None
@@ -192,12 +223,10 @@ def _store_samples(
     observation = embedding.as_encoder_input(config, timestep.observation)
 
     def target() -> vae.Target:
-        near = None
+        label = None
         if embedding.needs_nearness(config):
-            task = task_of(config)
-            assert task.label is not None
-            near = task.map(partial(task.label, env_params))(env_state)
-        return samples.target_of(config.encoder, observation, near)
+            label = _nearness(config, env_params, env_state) if near is None else near
+        return samples.target_of(config.encoder, observation, label)
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))
     wanted = lax.cond(keep, target, lambda: nothing)

@@ -40,17 +40,19 @@ class Networks:
     vae_optimiser: Any
     encoder: Params  # frozen encoder used for acting
     agent: State  # of the learner
+    teacher: PolicyParams | None = None  # of the learner's teacher, which never change; None without one
 
 
 def init_networks(config: Config, key: Array) -> Networks:
     """Returns networks that have learnt nothing, with their optimisers; `key` is consumed."""
     vae_key, agent_key = jax.random.split(key)
-    vae = embedding.init_params(config, vae_key)
+    vae, learner = embedding.init_params(config, vae_key), learner_of(config)
     return Networks(
         vae=vae,
         vae_optimiser=_vae_optimiser(config.encoder.learning_rate).init(vae) if vae else None,
         encoder=embedding.inference_params(config, vae),
-        agent=learner_of(config).init(config, agent_key),
+        agent=learner.init(config, agent_key),
+        teacher=None if learner.teacher is None else jax.tree.map(jnp.asarray, learner.teacher(config).params),
     )
 
 

@@ -53,13 +53,15 @@ def check_learner(config: Config) -> None:
 
     total = (Schedule.from_config(config).scheduled - Schedule.from_config(config).warmup) * config.train.num_envs
 
-    def act(state: Any, memory: Any, keys: Any, decisions: Any, episodes: Any) -> Any:
-        return learner.act(config, state, memory, keys, Exploration(decisions, total, episodes))
+    def act(state: Any, memory: Any, keys: Any, decisions: Any, episodes: Any, advice: Any) -> Any:
+        return learner.act(config, state, memory, keys, Exploration(decisions, total, episodes, advice))
 
-    moves, acted = _pair(config, "act", act, state, memory, keys, _numbers(), _numbers(shards, envs))
+    advised = learner.teacher is not None
+    advice = _numbers(shards, envs) if advised else None
+    moves, acted = _pair(config, "act", act, state, memory, keys, _numbers(), _numbers(shards, envs), advice)
     _check_integers(config, "act", moves, shards, envs)
     _check_metrics(config, "act", acted)
-    rows: Any = jax.eval_shape(partial(replay.empty_ring, length, envs, size))
+    rows: Any = jax.eval_shape(partial(replay.empty_ring, length, envs, size, advised=advised))
     rows = jax.tree.map(lambda x: jax.ShapeDtypeStruct((shards, *x.shape), x.dtype), rows)
     last = jax.ShapeDtypeStruct((), jnp.float32)
     update = partial(learner.update, config, None)

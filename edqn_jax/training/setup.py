@@ -24,6 +24,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.missions import MissionSet, missions_of_runs
 from edqn_jax.keys import run_streams
+from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.learn.state import TrainState
 from edqn_jax.learn.trainer import Trainer
@@ -94,6 +95,8 @@ class TrainingSetup:
             validate(each)
             check_learns(each)
         check_learner(config)
+        if (teacher := learner_of(config).teacher) is not None:
+            teacher(config)  # raises ConfigError, before anything is compiled
         if start is not None:
             check_begins(config, start)
         self.config, self.display, self.pool, self.began = config, display, pool, time.perf_counter()
