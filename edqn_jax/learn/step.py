@@ -173,7 +173,7 @@ def _advise(config: Config, networks: Networks, actors: Actors, timestep: Step, 
     teacher = learner_of(config).teacher
     if teacher is None:
         return None
-    assert near is not None
+    assert near is not None and networks.teacher is not None
     before = jax.tree.map(merge_shards, actors.advice)
     return advise(
         config, teacher(config).config, networks.teacher, before, timestep.observation, timestep.is_reset, near

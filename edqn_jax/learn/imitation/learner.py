@@ -65,8 +65,8 @@ def teacher_share(config: ImitationConfig, decisions: Array, total: int) -> Arra
     """Returns beta [], the share of moves that the teacher takes after so many decisions of `total`.
 
     >>> config = ImitationConfig(teacher_moves=0.8, teacher_fraction=0.5)
-    >>> print(jnp.round(teacher_share(config, jnp.array([0, 25, 50, 100]), 100), 2))
-    [0.8 0.4 0.  0. ]
+    >>> print([f"{teacher_share(config, jnp.int32(done), 100):.2f}" for done in (0, 25, 50, 100)])
+    ['0.80', '0.40', '0.00', '0.00']
     """
     done = jnp.clip(decisions / max(config.teacher_fraction * total, 1.0), 0.0, 1.0)
     return config.teacher_moves * (1.0 - done)

@@ -91,7 +91,7 @@ def test_the_stored_advice_is_what_the_teacher_decides_where_it_flies_itself(fol
         env = flat(state.actors.env)
         state, _ = learn(state, jnp.int32(step))
         ring = state.actors.replay
-        at = int(plan.replay_time(step)) % ring.advice.shape[1]
+        at = int(plan.replay_time(jnp.int32(step))) % ring.advice.shape[1]
         np.testing.assert_array_equal(ring.advice[:, at].reshape(-1), advice)
         advice, memory = fly(env, memory, ring.action[:, at].reshape(-1))
         np.testing.assert_allclose(flat(state.actors.advice.memory), memory, atol=1e-4)
