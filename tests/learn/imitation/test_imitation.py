@@ -72,8 +72,12 @@ def student(teacher: Path | str, **groups: Any) -> Config:
 
 
 @pytest.mark.slow
-def test_the_stored_advice_is_what_the_teacher_decides_where_it_flies_itself(folder: Path) -> None:
-    steps, config = 40, student(folder, imitation={"teacher_moves": 0.5, "teacher_fraction": 1.0})
+@pytest.mark.parametrize("mount", ["level", "body"])
+def test_the_stored_advice_is_what_the_teacher_decides_where_it_flies_itself(mount: str, tmp_path: Path) -> None:
+    camera = {"width": 8, "height": 6, "mount": mount}
+    save_policy(decisive(small(env={"sensor": "depth"}, agent={"history": 3}, camera=camera)), tmp_path / "depth")
+    half = {"teacher_moves": 0.5, "teacher_fraction": 1.0}
+    steps, config = 40, student(tmp_path / "depth", imitation=half, camera=camera)
     world, plan, (teacher, params) = miniature_world(config), Schedule.from_config(config), load_teacher(config)
     state = jax.jit(lambda key: init_training(config, world, key))(jax.random.key(0))
     learn = jax.jit(partial(train_step, config, world, None))
