@@ -1,4 +1,4 @@
-"""N drones in one process: physics, outcome, rays, shading, events and label of all of them in compiled loops."""
+"""N drones in one process: physics, outcome, pictures, events and label of all of them in compiled loops."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from conventional_stack import camera, events, flight, task, world
+from conventional_stack import events, flight, task, world
+from conventional_stack.cameras.columns import ColumnCamera
+from conventional_stack.cameras.rays import RayCamera
 from conventional_stack.stopwatch import Stopwatch
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
@@ -23,8 +25,8 @@ from edqn_jax.sim.sensors.sensor import frame_steps
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 
-_BLOCK = 8
-"""Drones whose frames are rendered together, so that their rays stay in the cache."""
+CAMERAS = {"rays": RayCamera, "columns": ColumnCamera}
+"""Cameras by name."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +132,8 @@ class Fleet:
     Until the next step `path` holds the poses, and `end_step` and `contact` are as in `edqn_jax.sim.task.env.Step`.
     """
 
-    def __init__(self, config: Config, course: Course, record: Record, seed: int) -> None:
-        """Allocates all arrays; `record` has one row for each drone.
+    def __init__(self, config: Config, course: Course, record: Record, seed: int, camera: str = "rays") -> None:
+        """Allocates all arrays; `record` has one row for each drone, `camera` is one of `CAMERAS`.
 
         Raises:
             ConfigError: if this stack does not support the configuration.
@@ -144,7 +146,6 @@ class Fleet:
         self.airframe = flight.airframe_of(config.drone, self.engine.model)
         self.command = flight.command_of(config, ACTIONS)
         self.rules = task.rules_of(config)
-        self.optics = camera.optics_of(config.camera)
         self.law = events.law_of(config.events)
         self.random = np.random.default_rng(seed)
 
@@ -157,9 +158,9 @@ class Fleet:
         self.end_step, self.contact = np.zeros(drones, np.int64), np.zeros(drones)
         self.frames = frame_steps(config)
         pixels = config.camera.height * config.camera.width
-        block = min(_BLOCK, drones)
+        block = min(CAMERAS[camera].block, drones)
+        self.camera = CAMERAS[camera](config.camera, self.world, block)
         self.poses = np.zeros((2, block, 7))
-        self.hits = [camera.Hits.empty(block, pixels) for _ in self.frames]
         self.luma = np.zeros((2, block, pixels))
         self.counts = record.events.reshape(drones, pixels)
         self.label = record.nearness.reshape(drones, pixels) if needs_nearness(config.encoder) else None
@@ -203,9 +204,9 @@ class Fleet:
             )  # fmt: skip
             self._write_own_states(record.final_own)
             task.own_motion(ACTIONS, record.action, record.final_own, self.state, record.motion)
-        for first in range(0, len(self.goal), _BLOCK):
-            drones = slice(first, min(first + _BLOCK, len(self.goal)))
-            self._render(drones)
+        block = self.poses.shape[1]
+        for first in range(0, len(self.goal), block):
+            self._render(slice(first, min(first + block, len(self.goal))))
         with self.stopwatch.time("outcome"):
             if restart:
                 for drone in np.flatnonzero(record.outcome):
@@ -221,17 +222,10 @@ class Fleet:
 
     def _render(self, drones: slice) -> None:
         """Computes the events of some drones, and the label of the newest frame."""
-        world, count = self.world, drones.stop - drones.start
+        count = drones.stop - drones.start
         poses, luma = self.poses[:, :count], self.luma[:, :count]
-        hits = [frame.first(count) for frame in self.hits]
-        with self.stopwatch.time("rays"):
-            for at, frame in enumerate(self.frames):
-                poses[at] = self.path[drones, frame]
-                camera.cast(world.model._address, world.data._address, self.optics, poses[at], hits[at])
-        with self.stopwatch.time("shading"):
-            for at in range(2):
-                camera.shade(world.geoms, self.optics, poses[at], hits[at], luma[at])
-            if self.label is not None:
-                camera.nearness(hits[1], self.label[drones])
+        for at, frame in enumerate(self.frames):
+            poses[at] = self.path[drones, frame]
+        self.camera.draw(self.stopwatch, poses, luma, None if self.label is None else self.label[drones])
         with self.stopwatch.time("events"):
             events.signed_counts(self.law, luma[0], luma[1], self.counts[drones])

@@ -39,6 +39,7 @@ PARTS = (
     "outcome",
     "rays",
     "shading",
+    "columns",
     "events",
     "waiting",
     "encoder",
@@ -142,8 +143,12 @@ class TimedDQN(stable_baselines3.DQN):
 class Training:
     """Drones, VAE and DQN of a configuration. A context manager, which ends the other processes."""
 
-    def __init__(self, config: Config, course: Course, processes: int = 1, threads: int = 1) -> None:
+    def __init__(
+        self, config: Config, course: Course, processes: int = 1, threads: int = 1, camera: str = "rays"
+    ) -> None:
         """Starts `config.train.num_envs` drones in `processes` processes and PyTorch with `threads` threads.
+
+        `camera` is one of `fleet.CAMERAS`.
 
         Raises:
             ConfigError: if this stack does not support the configuration.
@@ -153,7 +158,7 @@ class Training:
         check(config)
         self.config, self.threads, self.plan = config, threads, Schedule.from_config(config)
         self.warm, self.seconds = 0, 0.0
-        fleet = SpreadFleet(config, course, drones, processes, config.train.seed)
+        fleet = SpreadFleet(config, course, drones, processes, config.train.seed, camera)
         self.learner = Learner(config.encoder, config.camera, config.train.seed)
         self.env = CodedDrones(config, fleet, self.learner)
         self.stopwatch = fleet.stopwatch
@@ -237,9 +242,9 @@ class Training:
 class Steady:
     """A training after its warm-up, for timing: the counterpart of `measurement.whole.WholeStep`. A context manager."""
 
-    def __init__(self, config: Config, course: Course, processes: int, threads: int) -> None:
+    def __init__(self, config: Config, course: Course, processes: int, threads: int, camera: str = "rays") -> None:
         """Warms up, compiles, and fills the replay until updates begin; `config` must let the VAE learn throughout."""
-        self.training = Training(config, course, processes, threads)
+        self.training = Training(config, course, processes, threads, camera)
         self.training.warm_up()
         self.training.learn(config.agent.learning_starts + config.train.num_envs)
         self.training.stopwatch.seconds.clear()

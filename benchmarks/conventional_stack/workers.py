@@ -18,8 +18,10 @@ _RESET, _STEP = b"reset", b"step"
 class SpreadFleet:
     """`drones` drones in `processes` processes; `record` holds all of them."""
 
-    def __init__(self, config: Config, course: Course, drones: int, processes: int, seed: int) -> None:
-        """Starts the other processes; `close` ends them.
+    def __init__(
+        self, config: Config, course: Course, drones: int, processes: int, seed: int, camera: str = "rays"
+    ) -> None:
+        """Starts the other processes, with one of `fleet.CAMERAS`; `close` ends them.
 
         Raises:
             ConfigError: if this stack does not support the configuration.
@@ -37,13 +39,13 @@ class SpreadFleet:
         }
         self.record = _mapped(shared)
         each = drones // processes
-        self.fleet = Fleet(config, course, self.record.part(slice(0, each)), seed)
+        self.fleet = Fleet(config, course, self.record.part(slice(0, each)), seed, camera)
         self.workers = []
         for number in range(1, processes):
             ours, theirs = context.Pipe()
             share = slice(number * each, (number + 1) * each)
             process = context.Process(
-                target=_serve, args=(theirs, config, course, shared, share, seed + number), daemon=True
+                target=_serve, args=(theirs, config, course, shared, share, seed + number, camera), daemon=True
             )
             process.start()
             theirs.close()
@@ -83,9 +85,11 @@ def _mapped(shared: dict[str, Any]) -> Record:
     )
 
 
-def _serve(pipe: Connection, config: Config, course: Course, shared: dict[str, Any], share: slice, seed: int) -> None:
+def _serve(
+    pipe: Connection, config: Config, course: Course, shared: dict[str, Any], share: slice, seed: int, camera: str
+) -> None:
     """Runs in another process: executes requests until the pipe is closed."""
-    fleet = Fleet(config, course, _mapped(shared).part(share), seed)
+    fleet = Fleet(config, course, _mapped(shared).part(share), seed, camera)
     requests = {_RESET: fleet.reset, _STEP: fleet.step}
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Rays, shade, texture and label of the conventional camera against brute force and ours; its events too."""
+"""Rays, shade, texture and label of the conventional camera by rays against brute force and ours; its events too."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from conventional_stack import camera, events, task, world
+from conventional_stack import events, task, world
+from conventional_stack.cameras import rays as camera
+from conventional_stack.cameras.optics import optics_of
 from edqn_jax.config import CameraConfig, Config, EncoderConfig, EventsConfig
 from edqn_jax.sim.camera import camera as our_camera
 from edqn_jax.sim.scene.distance import signed_distance
@@ -37,7 +39,7 @@ def poses(scene, count, seed):
 
 def pictures(config, scene, pose):
     """Luma [M, H, W] and what was met."""
-    seen, optics = world.compiled(world.text_of(scene)), camera.optics_of(config)
+    seen, optics = world.compiled(world.text_of(scene)), optics_of(config)
     hits = camera.Hits.empty(len(pose), config.height * config.width)
     luma = np.empty((len(pose), config.height * config.width))
     camera.cast(seen.model._address, seen.data._address, optics, pose, hits)

@@ -13,7 +13,7 @@ import pytest
 
 import conventional
 from conventional_stack.fleet import Record
-from conventional_stack.settings import supported_config
+from conventional_stack.settings import AGENT, supported_config
 from conventional_stack.train import Steady, Trained, Training, fly, train
 from conventional_stack.vae import EventVAE, Learner
 from conventional_stack.vec_env import CodedDrones
@@ -357,6 +357,25 @@ def test_a_vae_that_this_stack_does_not_have_is_declined():
         train(config, course_of(START, GOAL))
 
 
+def test_the_camera_is_that_of_every_process():
+    course = course_of(START, GOAL)
+    seen = {}
+    for camera in ("rays", "columns"):
+        fleet = SpreadFleet(CONFIG, course, 2, 2, seed=0, camera=camera)
+        try:
+            fleet.reset()
+            for _ in range(3):
+                fleet.record.action[:] = 22
+                fleet.step()
+            seen[camera] = fleet.record.events.copy()
+        finally:
+            fleet.close()
+    # The drones fly alike; one ray a pixel makes events at silhouettes where an area makes none, or none where it does.
+    differ = [np.mean(a != b) for a, b in zip(seen["rays"], seen["columns"], strict=True)]
+    assert all(0 < share < 0.2 for share in differ), differ
+    np.testing.assert_array_equal(*seen["columns"])
+
+
 def test_a_timed_turn_replays_four_samples_a_decision_and_shows_the_vae_each_field_once():
     config = miniature()
     with Steady(config, course_of(START, GOAL), 1, 1) as run:
@@ -409,6 +428,30 @@ def test_the_command_says_what_it_measured(monkeypatch, tmp_path, capsys):
     assert report["workload"]["replayed_samples_per_decision"] == 4 and report["workload"]["physics"] == "c_mujoco"
     assert "torch" in report["versions"] and to_plain_json(report) == report
     assert "| rays |" in capsys.readouterr().out
+    assert all(row["camera"] == "rays" and row["shares"]["columns"] == 0 for row in report["rows"])
+
+
+def test_both_cameras_and_ours_take_turns(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(conventional, "SETTINGS", ((1, 1),))
+    monkeypatch.setattr(conventional, "use_cpu_devices", lambda: None)
+    file = tmp_path / "rows.json"
+    words = ["--camera", "rays", "columns", "--edqn", "--decisions", "32", "--repeats", "3", "--json", str(file)]
+    assert conventional.main([*words, "--", *MINIATURE]) == 0
+    rays, columns, ours = json.loads(file.read_text())["rows"]
+    assert rays["shares"]["columns"] == columns["shares"]["rays"] == columns["shares"]["shading"] == 0
+    assert rays["shares"]["rays"] > 0 and columns["shares"]["columns"] > 0
+    for row in (rays, columns):
+        ratios = [a / b for a, b in zip(ours["turns"], row["turns"], strict=True)]
+        assert row["edqn_over_it"] == pytest.approx(sorted(ratios)[1])
+    assert "decisions/s over it (products " in capsys.readouterr().out
+
+
+def test_ours_is_not_held_to_what_stable_baselines3_has():
+    _, stack_config, ours = conventional.parse(["--edqn"])
+    assert ours is not None and conventional.parse([])[2] is None
+    for name, value in AGENT.items():
+        assert getattr(ours.agent, name) == getattr(Config().agent, name)
+        assert getattr(stack_config.agent, name) == value
 
 
 @pytest.mark.slow

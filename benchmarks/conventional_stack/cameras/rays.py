@@ -13,44 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from conventional_stack.c_mujoco import mj_multi_ray
+from conventional_stack.cameras.optics import heading_of, optics_of
+from conventional_stack.stopwatch import Stopwatch
+from conventional_stack.world import World
 from edqn_jax.config import CameraConfig
 from edqn_jax.extras import require_extra
-from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
-from edqn_jax.sim.camera.raycast import image_plane, pitch_of, sun_direction
-from edqn_jax.sim.camera.texture import WAVES
 from edqn_jax.sim.scene.shapes.plane import HORIZON_M
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, HALF_NEAR_M
 
 numba = require_extra("numba")
-
-
-class Optics(NamedTuple):
-    """The camera as plain numbers."""
-
-    u: NDArray[np.float64]  # [W] rightwards, at unit depth
-    v: NDArray[np.float64]  # [H] upwards
-    pitch: float
-    ambient: float
-    sun: NDArray[np.float64]  # [3] unit
-    sky: float  # luma
-    waves: NDArray[np.float64]  # [4, 3] cycles per metre
-    weights: NDArray[np.float64]  # [4] contrast of each
-
-
-def optics_of(config: CameraConfig) -> Optics:
-    """Returns the camera of a configuration."""
-    u, v = image_plane(config, 1, 1)
-    per_metre = [np.array(wave.direction) / (config.texture_period_m * wave.octave) for wave in WAVES]
-    return Optics(
-        u=u.astype(np.float64),
-        v=v.astype(np.float64),
-        pitch=pitch_of(config),
-        ambient=config.ambient,
-        sun=np.array(sun_direction(config)),
-        sky=float(np.dot(config.sky_rgb, LUMA_WEIGHTS)),
-        waves=np.array(per_metre),
-        weights=config.texture_contrast * np.array([wave.weight for wave in WAVES]),
-    )
 
 
 class Hits(NamedTuple):
@@ -72,14 +43,6 @@ class Hits(NamedTuple):
         return Hits(self.ray[:frames], self.geom[:frames], self.depth[:frames], self.normal[:frames])
 
 
-@numba.njit(cache=True, inline="always")
-def _heading(pose):
-    """Returns cosine and sine of the heading of a pose [7]."""
-    w, z = pose[3], pose[6]
-    scale = 1.0 / max(w * w + z * z, 1e-9)
-    return (w * w - z * z) * scale, 2 * w * z * scale
-
-
 @numba.njit(cache=True, error_model="numpy")
 def cast(model, data, optics, pose, hits):
     """Casts the rays of M frames.
@@ -91,7 +54,7 @@ def cast(model, data, optics, pose, hits):
     """
     width, height = len(optics.u), len(optics.v)
     for m in range(len(pose)):
-        cos, sin = _heading(pose[m])
+        cos, sin = heading_of(pose[m])
         ray = hits.ray[m]
         for row in range(height):
             for column in range(width):
@@ -123,7 +86,7 @@ def _wave(phase):
 def shade(geoms, optics, pose, hits, luma):
     """Computes the luma [M, P] of M frames from their ray hits: albedo x Lambert shade x texture."""
     for m in range(len(pose)):
-        cos, sin = _heading(pose[m])
+        cos, sin = heading_of(pose[m])
         ox, oy, oz = pose[m, 0], pose[m, 1], pose[m, 2]
         for p in range(luma.shape[1]):
             geom = hits.geom[m, p]
@@ -161,3 +124,32 @@ def nearness(hits, label):
             dx, dy, dz = hits.ray[m, p, 0], hits.ray[m, p, 1], hits.ray[m, p, 2]
             metres = hits.depth[m, p] * math.sqrt(dx * dx + dy * dy + dz * dz)
             label[m, p] = DEPTH_SCALE / (1.0 + metres / HALF_NEAR_M) if hits.geom[m, p] >= 0 else 0.0
+
+
+class RayCamera:
+    """A `Camera` by rays."""
+
+    block = 8
+
+    def __init__(self, config: CameraConfig, world: World, drones: int) -> None:
+        """Allocates the hits of a block of so many drones."""
+        self.world, self.optics = world, optics_of(config)
+        self.hits = [Hits.empty(drones, config.height * config.width) for _ in range(2)]
+
+    def draw(
+        self,
+        stopwatch: Stopwatch,
+        poses: NDArray[np.float64],
+        luma: NDArray[np.float64],
+        label: NDArray[np.float32] | None,
+    ) -> None:
+        """Draws as `Camera.draw`."""
+        world, hits = self.world, [frame.first(poses.shape[1]) for frame in self.hits]
+        with stopwatch.time("rays"):
+            for at in range(2):
+                cast(world.model._address, world.data._address, self.optics, poses[at], hits[at])
+        with stopwatch.time("shading"):
+            for at in range(2):
+                shade(world.geoms, self.optics, poses[at], hits[at], luma[at])
+            if label is not None:
+                nearness(hits[1], label)
