@@ -113,8 +113,8 @@ def measure(
     edqn: list[float] = []
     with ExitStack() as stack:
         runs = {
-            (camera, *setting): stack.enter_context(Steady(config, course, *setting, camera))
-            for camera, *setting in turns
+            (camera, processes, threads): stack.enter_context(Steady(config, course, processes, threads, camera))
+            for camera, processes, threads in turns
         }
         own = None if ours is None else Ours(ours)
         watch = Watch()

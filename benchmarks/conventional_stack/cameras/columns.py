@@ -65,11 +65,12 @@ class Work(NamedTuple):
         """Allocates the arrays."""
         image, most = (width, height), (DEPTH_OF_LAYERS + 1) * width * height
         return cls(
-            np.empty(image, np.int64),
-            np.empty((*image, DEPTH_OF_LAYERS, 4)),
-            *(np.empty(image) for _ in range(2)),
-            np.empty((6, most), np.float32),
-            np.empty(most, np.float32),
+            number=np.empty(image, np.int64),
+            layers=np.empty((*image, DEPTH_OF_LAYERS, 4)),
+            share=np.empty(image),
+            shown=np.empty(image),
+            places=np.empty((6, most), np.float32),
+            factor=np.empty(most, np.float32),
         )
 
 
