@@ -15,7 +15,8 @@ from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.report.page.worlds import ball_data, world_data
 from edqn_jax.report.sights import FlightRenderer, decision_rows, times_of, trajectory_poses
 from edqn_jax.report.worlds.flights import plot_path, plot_world
-from edqn_jax.report.worlds.solids import MAP, make_cutaway, moving_solids, solids_of, static_scene
+from edqn_jax.report.worlds.solids import make_cutaway, moving_solids, solids_of, static_scene
+from edqn_jax.report.worlds.views import MAP
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene

@@ -125,11 +125,11 @@ def _far_distances(table: Array, nearest: NDArray[np.int32], near: NDArray[np.fl
     """
     far = ~np.isfinite(near)
     places = np.argwhere(far).astype(np.int32)
-    layers = np.ceil(distance_transform_edt(far)[far] - 1e-3).astype(np.int32)
+    layers = np.ceil(np.asarray(distance_transform_edt(far))[far] - 1e-3).astype(np.int32)
     order = np.argsort(layers, kind="stable")
     points = (cell * (places[order] - (np.array(near.shape) - 1) / 2)).astype(np.float32)
     known = np.pad(np.where(far, -1, nearest), _STEP, constant_values=-1).astype(np.int32)
-    here = np.ravel_multi_index(tuple(places[order].T + _STEP), known.shape)
+    here = np.asarray(np.ravel_multi_index(tuple(places[order].T + _STEP), known.shape))
     apart = [int(offset @ np.array(known.strides) // known.itemsize) for offset in _neighbours()]
     known, found = known.reshape(-1), np.empty(len(places), np.float32)
     ends = np.searchsorted(layers[order], np.arange(1, layers.max(initial=0) + 2))
