@@ -17,9 +17,10 @@ import trimesh
 
 from edqn_jax.config import SHAPES
 from edqn_jax.native import build
+from edqn_jax.sim.scene.mesh_field import Grid
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.shapes import field_rays
-from edqn_jax.sim.scene.shapes.field import _least_of_blocks
+from edqn_jax.sim.scene.shapes.field import Fields, _least_of_blocks
 from edqn_jax.sim.scene.shapes.kind import TINY
 from tests.support.meshes import CUBE, hull, mesh_world
 
@@ -69,7 +70,7 @@ def test_the_constants_in_c_are_those_of_python() -> None:
     found = re.findall(r"^#define (\w+) ([\d.e+-]+)f?\b", field_rays.HEADERS[0].read_text(), re.MULTILINE)
     own = {"AT_ONCE": ("1", "2"), "TOGETHER": ("1", str(field_rays.TOGETHER))}
     assert {value for name, value in found if name == "TOGETHER"} == {*own["TOGETHER"]}
-    shared = ("STEPS", "STOPS", "CONE", "BLOCK", "PER_CELL", "FAR_M", "REFINED", "WORTH")
+    shared = ("STEPS", "STOPS", "CONE", "BLOCK", "PER_CELL", "FAR_M", "REFINED", "WORTH", "ROUNDED")
     finer = ("FINER_STEPS", "FINER_WORTH", "FINER_ROOM")
     assert dict(each for each in found if each[0] not in own).keys() == {"TINY", *shared, *finer}
     for name, value in found:
@@ -191,3 +192,19 @@ def test_a_plate_of_a_millimetre_is_seen_from_the_front_and_aslant(
         depth, hit, *_ = jax.jit(lambda o, r: meet(fields, o, r))(jnp.asarray(origin), jnp.asarray(rays))
         assert np.all(hit)
         np.testing.assert_allclose(np.asarray(depth), 1, atol=0.1)
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_no_ray_reads_beyond_a_grid_so_long_that_32_bits_round_its_numbers(
+    native: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not native:
+        monkeypatch.setattr(field_rays, "is_available", lambda platform: False)
+    half, nothing = np.array([20100.0, 0.4, 0.4]), (np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    free = Grid.of(np.full((40001, 2, 2), 3.0), 1.0, half, *nothing)
+    # What is beyond the first grid is the second.
+    full = Grid.of(np.full((2, 2, 2), -3.0), 1.0, half, *nothing)
+    place = jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.asarray(half, jnp.float32)[None], jnp.zeros(1), jnp.ones((1, 3))
+    rays = jnp.asarray(np.tile(np.array([1, 0.0001, 0], np.float32), (1, 8, 1)))
+    _, hit, *_ = meet(Fields(*place, grids=(free, full)), jnp.array([19990.0, 0.0, 0.0]), rays)
+    assert not bool(hit.any())

@@ -24,6 +24,7 @@
 #define REFINED 3
 #define PER_CELL 1000.0f
 #define FAR_M 1e30f
+#define ROUNDED 1.2e-7f
 
 #if WIDE == 1
 #define TOGETHER 1
@@ -40,6 +41,7 @@ typedef struct {
   int across, along;     /* values from one place to the next along x and y */
   int blocks_across, blocks_along;
   float last[3]; /* number of the last value along each axis */
+  float most[3]; /* where a ray is taken to be at most: in the last cell, also where so large a number is rounded */
   float cell, per_cell;
 } Lattice;
 
@@ -65,8 +67,8 @@ FN Wide one_over(Wide x) { return 1.0f / choose(size_of(x) < TINY, wide(TINY), x
 
 FN Lattice lattice_of(const int16_t* values, const float* least, const int32_t* counts, float cell) {
   const int y = (counts[1] + BLOCK - 2) / BLOCK, z = (counts[2] + BLOCK - 2) / BLOCK;
-  const Lattice g = {values, least, counts[1] * counts[2], counts[2], y * z, z,
-                     {(float)(counts[0] - 1), (float)(counts[1] - 1), (float)(counts[2] - 1)}, cell, 1.0f / cell};
+  Lattice g = {values, least, counts[1] * counts[2], counts[2], y * z, z, {0}, {0}, cell, 1.0f / cell};
+  for (int i = 0; i < 3; ++i) g.last[i] = (float)(counts[i] - 1), g.most[i] = g.last[i] * (1 - ROUNDED) - 0.001f;
   return g;
 }
 
@@ -81,9 +83,9 @@ FN View view_of(const Lattice* g, const float* position, const float* turn, cons
   return v;
 }
 
-/* Where rays are at a depth, in cells from the first value along axis `i`; a little less than the last. */
+/* Where rays are at a depth, in cells from the first value along axis `i`. */
 FN Wide along_axis(const Lattice* g, const View* v, int i, Wide d, Wide depth) {
-  return smaller(larger(v->from[i] + depth * d, wide(0)), wide(g->last[i] - 0.001f));
+  return smaller(larger(v->from[i] + depth * d, wide(0)), wide(g->most[i]));
 }
 
 /* The least distances in the blocks where rays are. */

@@ -41,6 +41,9 @@ FINER_STEPS, FINER_WORTH, FINER_ROOM = 4, 0.1, 0.2
 FAR_M = 1e30
 """Depth of rays that meet nothing."""
 
+ROUNDED = 1.2e-7
+"""Share of a number by which the next smaller one of 32 bits may be smaller."""
+
 NOWHERE = 1e29
 
 SOURCES = {name: Path(__file__).with_name(f"field_rays.{name}") for name in ("c", "cu")}

@@ -31,7 +31,7 @@ class _Lattices(NamedTuple):
     along: Array
     blocks_across: Array
     blocks_along: Array
-    last: Sequence[Array]  # number of the last value along each axis
+    most: Sequence[Array]  # where along each axis a ray is taken to be at most: in the last cell
     eye: Sequence[Array]  # in cells
     cell: Array
     end: Array  # distance at which rays end at depth 0, and what it grows by with depth, thousandths of a cell
@@ -103,7 +103,7 @@ def _lattices(table: tuple[np.ndarray, ...], fields: Any, o: Sequence[Array]) ->
         along=count[2],
         blocks_across=y * z,
         blocks_along=z,
-        last=last,
+        most=[each * (1 - field_rays.ROUNDED) - 0.001 for each in last],
         eye=[o[i] / cell + last[i] / 2 for i in range(3)],
         cell=cell,
         end=jnp.full((), PER_CELL * STOPS),
@@ -113,7 +113,7 @@ def _lattices(table: tuple[np.ndarray, ...], fields: Any, o: Sequence[Array]) ->
 
 def _placed(g: _Lattices, d: Sequence[Array], depth: Array) -> _Places:
     """Returns where rays `d`, cells, are at a depth."""
-    return _Places(depth, [jnp.clip(g.eye[i] + depth * d[i], 0.0, g.last[i] - 0.001) for i in range(3)])
+    return _Places(depth, [jnp.clip(g.eye[i] + depth * d[i], 0.0, g.most[i]) for i in range(3)])
 
 
 def _least_around(g: _Lattices, at: Sequence[Array]) -> Array:
