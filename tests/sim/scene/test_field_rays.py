@@ -208,3 +208,20 @@ def test_no_ray_reads_beyond_a_grid_so_long_that_32_bits_round_its_numbers(
     rays = jnp.asarray(np.tile(np.array([1, 0.0001, 0], np.float32), (1, 8, 1)))
     _, hit, *_ = meet(Fields(*place, grids=(free, full)), jnp.array([19990.0, 0.0, 0.0]), rays)
     assert not bool(hit.any())
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_a_ray_that_comes_near_to_wide_ground_and_leaves_it_meets_nothing(
+    native: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not native:
+        monkeypatch.setattr(field_rays, "is_available", lambda platform: False)
+    height = np.broadcast_to(0.1 * (np.arange(41.0) - 20), (641, 5, 41))
+    half = np.array([31.0, 0.15, 1.9])
+    ground = Grid.of(height, 0.1, half, np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+    place = jnp.zeros((1, 3)), jnp.eye(3)[None], jnp.asarray(half, jnp.float32)[None], jnp.zeros(1), jnp.ones((1, 3))
+    rays = np.tile(np.array([1, 0, -0.005], np.float32), (1, 8, 1))
+    rays[0, 4:, 2] = -0.02  # arrives
+    depth, hit, *_ = meet(Fields(*place, grids=(ground,)), jnp.array([-30.0, 0.0, 0.5]), jnp.asarray(rays))
+    np.testing.assert_array_equal(hit[0, 0], [False] * 4 + [True] * 4)
+    np.testing.assert_allclose(depth[0, 0, 4:], 25, rtol=0.01)

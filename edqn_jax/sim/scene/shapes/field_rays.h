@@ -13,7 +13,7 @@
 
 #define TINY 1e-9f                /* kind.py; the others are of field_rays.py: tests/sim/scene/test_field_rays.py holds
                                      them equal */
-#define STEPS 64
+#define STEPS 256
 #define STOPS 0.002f
 #define CONE 0.00002f
 #define BLOCK 4

@@ -13,7 +13,7 @@ from jax import Array
 from edqn_jax.native import build
 from edqn_jax.sim.scene.shapes.kind import Vector
 
-STEPS = 64
+STEPS = 256
 """Most steps of a ray, each out of a cell and on by the distance there: along a wall they are short."""
 
 STOPS, CONE = 0.002, 0.00002
