@@ -121,7 +121,7 @@ def _far_distances(table: Array, nearest: NDArray[np.int32], near: NDArray[np.fl
     """Returns the distances of the points of a lattice at which those `near` [X, Y, Z] are infinite.
 
     Layer by layer away from the surface, a point is compared with the nearest triangles of its neighbours in the layers
-    before and in its own: all that differ of them, which are two or three.
+    before: all that differ of them, which are two or three.
     """
     far = ~np.isfinite(near)
     places = np.argwhere(far).astype(np.int32)
