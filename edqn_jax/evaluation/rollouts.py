@@ -291,11 +291,11 @@ def _begin(program: _Program, env_params: EnvParams, params: Any, number: Array,
     action = _action_of(config, program.actor, params)
     # The first decision resets every environment: the observation and the action before it are not used.
     state = jax.vmap(partial(task.begin, env_params))(keys, number)
+    actions = jnp.zeros((missions, *action.shape), action.dtype)
+    seen = jax.eval_shape(task.map(partial(task.step, env_params)), state, actions)[1].observation
     return _Flying(
         state=state,
-        observation=jax.tree.map(
-            lambda leaf: jnp.zeros((missions, *leaf.shape), leaf.dtype), blank_observation(config)
-        ),
+        observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),
         memory=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (missions, *leaf.shape)), program.actor.init()),
         flights=jax.vmap(partial(_at_start, config, env_params))(state),
         record=_blank(config, missions, action) if program.extras.record else None,

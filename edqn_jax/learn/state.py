@@ -16,7 +16,7 @@ from jax import Array
 
 from edqn_jax.config import Config
 from edqn_jax.learn import replay, samples
-from edqn_jax.learn.actor import AgentActor, blank_observation, observation_size
+from edqn_jax.learn.actor import AgentActor, observation_size
 from edqn_jax.learn.imitation.advice import Advice, no_advice
 from edqn_jax.learn.learner import Metrics, learner_of
 from edqn_jax.learn.perception import embedding
@@ -150,7 +150,8 @@ def _empty_samples(config: Config, env_params: EnvParams, state: EnvState) -> Sa
     task, shards, envs = task_of(config), config.train.shards, config.train.num_envs
 
     def one(state: EnvState) -> Samples:
-        observation = embedding.as_encoder_input(config, blank_observation(config))
+        step = task.step(env_params, state, task.still)[1]
+        observation = embedding.as_encoder_input(config, step.observation)
         near = None if task.label is None else task.label(env_params, state)
         wanted = samples.target_of(config.encoder, observation, near)
         return samples.samples_of(config.encoder, observation, wanted)

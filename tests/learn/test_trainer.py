@@ -19,9 +19,7 @@ from edqn_jax.config import (
     MotorsConfig,
     NoiseConfig,
 )
-from edqn_jax.evaluation import rollouts
 from edqn_jax.learn import replay, saved_state
-from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import TrainState, init_state
 from edqn_jax.learn.step import _encode_observations, policy_of, run_steps, train_step
@@ -89,24 +87,6 @@ def on_two(world: EnvParams):
 def test_the_training_chunk_is_traced_exactly_once_in_a_run(on_two) -> None:
     states, _, traces, _ = on_two
     assert len(states) == 5
-    assert traces == 1
-
-
-def test_a_step_is_traced_for_what_runs_it_alone(world: EnvParams, monkeypatch: pytest.MonkeyPatch) -> None:
-    traces, step = 0, env.step
-
-    def counted(*args):
-        nonlocal traces
-        traces += 1
-        return step(*args)
-
-    monkeypatch.setattr(env, "step", counted)
-    made = Trainer(TINY, world, jax.devices()[:1])
-    made.shapes()
-    jax.make_jaxpr(partial(init_state, TINY, world))(jax.random.key(1))
-    assert traces == 0
-    params = jax.eval_shape(lambda: fresh_policy(TINY))
-    rollouts.trace_missions(TINY, world, params, jax.random.key(0), record=True, mesh=made.mesh)
     assert traces == 1
 
 

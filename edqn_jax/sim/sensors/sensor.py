@@ -191,7 +191,7 @@ class Sensor:
         return found
 
     def check(self, config: Config, sensed: Sensed) -> None:
-        """Raises unless `sensed` has the shape that `shape` says, in float32.
+        """Raises unless `sensed` has the shape that `shape` says, in floating-point numbers.
 
         Raises:
             ConfigError: names both shapes, or the type of the numbers.
@@ -201,7 +201,7 @@ class Sensor:
         if wanted != shown:
             raise ConfigError(f"the sensor '{name}' shows {shown}, but its shape is {wanted}; both must be the same")
         for numbers in jax.tree.leaves(sensed, is_leaf=_is_field):
-            if not (_is_field(numbers) or numbers.dtype == jnp.float32):
+            if not (_is_field(numbers) or jnp.issubdtype(numbers.dtype, jnp.floating)):
                 raise ConfigError(f"the sensor '{name}' must show float32 numbers, not {numbers.dtype}")
 
     def example(self, config: Config) -> Sensed:
