@@ -51,7 +51,7 @@ def poses(scene: Scene, seed: int) -> tuple[jax.Array, jax.Array]:
     """Places in the volume, inside of shapes as well but not at their surfaces, and turns of drones that lean."""
     rng = np.random.default_rng(seed)
     place = rng.uniform([2, 2, 0.5], [15, 8, 5], (2 * COUNT, 3)).astype(np.float32)
-    each = jax.vmap(partial(shape_distances, scene))(place).values()
+    each = jax.vmap(partial(shape_distances, scene))(jnp.asarray(place)).values()
     nearest = np.min([np.abs(distances).min(1) for distances in each], axis=0)
     place = place[nearest > BESIDE_M][:COUNT]
     leans = rng.uniform(-0.4, 0.4, (COUNT, 2))
