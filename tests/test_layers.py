@@ -27,6 +27,7 @@ ORDER = (
         "config",
         "devices",
         "native",
+        "kept_programs",
     ),
     *("sim.actions", "sim.scene", "sim.worlds", "sim.physics", "sim.camera", "sim.sensors", "sim.task", "sim"),
     *("planning", "learn.perception", "learn", "policies", "evaluation", "training"),

@@ -20,6 +20,9 @@ MAX_BYTES = 2**30
 """Of kept programs; beyond this the older ones are deleted."""
 
 
+_enabled: list[Path] = []  # the folder, once this process keeps programs in it
+
+
 def enable_compilation_cache() -> None:
     """Enables JAX's persistent compilation cache; must be called before anything is compiled.
 
@@ -34,10 +37,16 @@ def enable_compilation_cache() -> None:
     folder = private_folder()
     if folder is None:
         return
+    _enabled.append(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     # Such as on a full disk: the program is not kept, and nothing else is lost.
     warnings.filterwarnings("ignore", "Error writing persistent compilation cache entry", UserWarning)
+
+
+def enabled_folder() -> Path | None:
+    """Returns the folder in which this process keeps programs; None if it keeps none, or in a folder of the user's."""
+    return _enabled[-1] if _enabled else None
 
 
 def private_folder() -> Path | None:

@@ -20,6 +20,7 @@ from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import decoder
 from edqn_jax.keys import run_streams
+from edqn_jax.kept_programs import place_of, without_seed
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task import group
@@ -79,7 +80,7 @@ class _Flying:
     key: Array
 
 
-class _Programs(NamedTuple):
+class Programs(NamedTuple):
     """Compiled functions of which flying consists."""
 
     begin: Any
@@ -109,6 +110,7 @@ def fly_missions(
     extras: Extras = Extras(),
     mesh: Mesh | None = None,
     tell: Callable[[int, int], None] | None = None,
+    programs: Programs | None = None,
 ) -> Flights:
     """Flies each of the world's M missions once, greedily.
 
@@ -128,6 +130,7 @@ def fly_missions(
             which codes are exchanged.
         tell: called with how many flights have ended, and M: once it is compiled, and as they end. The host then
             starts the loop piece by piece, which changes no flight; of several processes none is told.
+        programs: of `trace_missions` for such arguments; None compiles them where this process has not yet.
 
     Returns:
         Flights of the M missions, on the devices.
@@ -137,7 +140,7 @@ def fly_missions(
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
     program, missions = _Program(config, actor or AgentActor(config), extras), _count(env_params)
-    begin, fly_on, end = _programs(mesh)
+    begin, fly_on, end = programs or _programs(mesh)
     flying = begin(program, env_params, params, key)
     if tell is None or jax.process_count() > 1:
         return end(missions, fly_on(program, env_params, params, flying, NO_END)[0])
@@ -178,16 +181,36 @@ def fly_on_all_devices(
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     env_params, params = jax.device_put((env_params, params), NamedSharding(mesh, PartitionSpec()))
     key = run_streams(seed).flights
-    extras = Extras(record, shuffle_codes, decoder_errors)
-    flights = fly_missions(config, env_params, params, key, actor=actor, extras=extras, mesh=mesh, tell=tell)
+    options: Any = {"extras": Extras(record, shuffle_codes, decoder_errors), "mesh": mesh}
+    is_agent = actor is None or actor == AgentActor(config)
+    programs = trace_missions(config, env_params, params, key, **options)() if is_agent else None
+    flights = fly_missions(config, env_params, params, key, actor=actor, tell=tell, programs=programs, **options)
     return jax.tree.map(np.asarray, flights)
 
 
 def trace_missions(
-    config: Config, env_params: EnvParams, params: Any, key: Array, *, record: bool, mesh: Mesh
-) -> list[jax.stages.Lowered]:
-    """Returns the programs that `fly_missions` runs for the agent, to be compiled ahead of its first call."""
-    program = _Program(config, AgentActor(config), Extras(record=record))
+    config: Config, env_params: EnvParams, params: Any, key: Array, *, extras: Extras, mesh: Mesh
+) -> Callable[[], Programs]:
+    """Returns a function that compiles what `fly_missions` runs for the agent, or loads it where it is kept.
+
+    Tracing is done here, so that the function has little left to do in Python.
+    """
+    program = _Program(config, AgentActor(config), extras)
+    arguments = env_params, params, key
+    told_apart = without_seed(config), extras, [device.id for device in mesh.devices.flat]
+    place = place_of("flights", told_apart, arguments)
+    traced = None if place.holds_programs() else _lower(program, mesh, *arguments)
+
+    def compile_all() -> Programs:
+        compiled = place.load()
+        if compiled is None:
+            compiled = place.compile(traced or _lower(program, mesh, *arguments), [*mesh.devices.flat])
+        return Programs(*map(_without_static, compiled))
+
+    return compile_all
+
+
+def _lower(program: _Program, mesh: Mesh, env_params: EnvParams, params: Any, key: Array) -> list[jax.stages.Lowered]:
     begin, fly_on, end = _programs(mesh)
     first = begin.trace(program, env_params, params, key)
     flying = jax.tree.map(
@@ -202,6 +225,11 @@ def trace_missions(
     ]
 
 
+def _without_static(compiled: jax.stages.Compiled) -> Callable[..., Any]:
+    """Returns a compiled program as it is called before it is compiled: with its static argument, the first."""
+    return lambda static, *arguments: compiled(*arguments)
+
+
 def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
     """Returns the keys [M] of the missions' environments, and that of the loop; `key` is consumed."""
     reset_key, loop_key = jax.random.split(key)
@@ -209,12 +237,12 @@ def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
 
 
 @functools.cache
-def _programs(mesh: Mesh | None, options: tuple[tuple[str, str | bool], ...] | None = None) -> _Programs:
+def _programs(mesh: Mesh | None, options: tuple[tuple[str, str | bool], ...] | None = None) -> Programs:
     """Returns what flies on the devices of a mesh, compiled with the platform's options, or with others."""
     platform = (jax.devices()[0] if mesh is None else mesh.devices.flat[0]).platform
     compiled = partial(jax.jit, compiler_options=compiler_options(platform) if options is None else dict(options))
     # Static by position: an argument passed by name would compile another program.
-    return _Programs(
+    return Programs(
         begin=compiled(partial(_begin_all, mesh), static_argnums=0),
         fly_on=compiled(partial(_fly_on_all, mesh), static_argnums=0, donate_argnums=3),
         end=compiled(partial(_end_all, mesh), static_argnums=0),

@@ -21,7 +21,9 @@ from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.keys import run_streams
+from edqn_jax.kept_programs import Place, place_of, without_seed
 from edqn_jax.learn.checked import CheckedChunk
+from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.policy import Policy
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import Episodes, Losses, TrainState, init_state
@@ -66,6 +68,7 @@ class Trainer:
         self.env_params = processes.replicate(
             env_params if isinstance(env_params, EnvParams) else _stack_missions(env_params), self.mesh
         )
+        self._place: Place | None = None
         self._traced: jax.stages.Lowered | None = None
         self._shapes: TrainState | None = None
         self._chunk = None
@@ -88,11 +91,14 @@ class Trainer:
             networks = begin_networks(self.config, state.learner, start.config, start.params)
             return dataclasses.replace(state, learner=networks)
 
-        make = jax.jit(self._each(begin, 0))
         keys = [run_streams(number).learning for number in ([seed] if isinstance(seed, int) else seed)]
+        arguments = self.env_params, keys[0] if self.agents is None else jnp.stack(keys)
+        place = Place(None) if start is not None else self._place_of("first_state", arguments)
+        [make] = place.load() or [None]
+        if make is None:
+            [make] = place.compile([jax.jit(self._each(begin, 0)).lower(*arguments)], [*self.mesh.devices.flat])
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
-        whole = make(self.env_params, keys[0] if self.agents is None else jnp.stack(keys))
-        return jax.jit(lambda state: state, out_shardings=self._layout())(whole)
+        return jax.jit(lambda state: state, out_shardings=self._layout())(make(*arguments))
 
     def _each(self, function: Callable[..., Any], *axes: int | None) -> Callable[..., Any]:
         """Returns `function(world, *arguments)` for all agents; `axes` are those of the other arguments."""
@@ -139,15 +145,36 @@ class Trainer:
             self._chunk = CheckedChunk(self.config, run, self.env_params, self.shapes(), self._steps(0))
             return
         self.trace()
-        assert self._traced is not None
-        self._chunk = self._traced.compile(compiler_options(self.mesh.devices.flat[0].platform))
+        assert self._place is not None
+        [self._chunk] = self._place.load() or [None]
+        if self._chunk is None:
+            traced = self._traced or self._lower()
+            devices = [*self.mesh.devices.flat]
+            [self._chunk] = self._place.compile([traced], devices, compiler_options(devices[0].platform))
         self._traced = None
 
     def trace(self) -> None:
-        """Traces the chunk, so that `compile` has little left to do in Python; nothing with `train.debug`."""
-        if self.config.train.debug or self._traced is not None:
+        """Traces the chunk, so that `compile` has little left to do in Python, unless it is kept.
+
+        Does nothing with `train.debug`.
+        """
+        if self.config.train.debug or self._place is not None:
             return
-        state = self.shapes()
+        self._place = self._place_of("training", self._arguments())
+        if not self._place.holds_programs():
+            self._traced = self._lower()
+
+    def _place_of(self, name: str, arguments: Any) -> Place:
+        """Returns where a program of this trainer is kept; nowhere if it may hold what is in a teacher's files."""
+        if learner_of(self.config).teacher is not None:
+            return Place(None)
+        devices = [device.id for device in self.mesh.devices.flat]
+        return place_of(name, (without_seed(self.config), self.agents, devices), arguments)
+
+    def _arguments(self) -> tuple[EnvParams, TrainState, Array]:
+        return self.env_params, self.shapes(), self._steps(0)
+
+    def _lower(self) -> jax.stages.Lowered:
         # One spec for each subtree: only environments and replay are spread, and what they return.
         spread, same = self._spread(), PartitionSpec()
         specs: Any = TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
@@ -160,7 +187,7 @@ class Trainer:
             out_specs=(specs, (self._spread(None), same)),
             check_vma=False,
         )
-        self._traced = jax.jit(run, donate_argnums=1).lower(self.env_params, state, self._steps(0))
+        return jax.jit(run, donate_argnums=1).lower(*self._arguments())
 
     def _steps(self, first: int) -> Array:
         numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)

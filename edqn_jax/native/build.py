@@ -51,6 +51,25 @@ C = Compiler(
 )
 
 
+@dataclasses.dataclass(frozen=True)
+class Library:
+    """What `ensure_registered` was asked for."""
+
+    source: Path
+    targets: tuple[str, ...]
+    definitions: tuple[str, ...]
+    by: Compiler
+    headers: tuple[Path, ...]
+
+
+_USED: dict[Library, None] = {}  # in the order in which they were registered
+
+
+def used_libraries() -> list[Library]:
+    """Returns the libraries that this process has registered with XLA."""
+    return list(_USED)
+
+
 @functools.cache
 def cuda_compiler() -> Compiler | None:
     """Returns the compiler for NVIDIA GPUs like the first of this process; None where there is none."""
@@ -114,7 +133,10 @@ def ensure_registered(
         headers: that the source includes from beside it.
     """
     with _ONE_AT_A_TIME:
-        return _registered(source, targets, definitions, by, headers)
+        found = _registered(source, targets, definitions, by, headers)
+        if found:
+            _USED[Library(source, targets, definitions, by, headers)] = None
+        return found
 
 
 def ensure_for(platform: str, sources: Mapping[str, Path], targets: tuple[str, ...], headers: tuple[Path, ...]) -> bool:

@@ -7,7 +7,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import jax
 import numpy as np
@@ -37,6 +37,8 @@ from edqn_jax.sim.task.reward import Reward, check_reward
 from edqn_jax.sim.worlds import geodesic
 from edqn_jax.training.learner_check import check_learner
 from edqn_jax.user_code import describe_object
+
+Made = TypeVar("Made")
 
 
 class Display(Protocol):
@@ -116,10 +118,12 @@ class TrainingSetup:
         display.phase("compiling")
         began = time.perf_counter()
         self.trainer.trace()
-        self._compiled = _in_background(pool, self.trainer.compile, began)
+        self._compiled = _in_background(pool, lambda: _timed(self.trainer.compile, began))
         placed = self._placed(self.missions[0].validation, fresh_policy(self.config), 0)
-        flights = rollouts.trace_missions(self.config, *placed, record=True, mesh=self.mesh)
-        self._rollouts_compiled = _in_background(pool, lambda: [each.compile() for each in flights], began)
+        compile_flights = rollouts.trace_missions(
+            self.config, *placed, extras=rollouts.Extras(record=True), mesh=self.mesh
+        )
+        self._flights_compiled = _in_background(pool, compile_flights)
         self._first: TrainState | None = None
         self.shortest = processes.run_synchronised(self._shortest)
 
@@ -142,7 +146,7 @@ class TrainingSetup:
 
     def fly(self, missions: MissionSet, params: PolicyParams, agent: int = 0) -> Flights:
         """Returns the missions, flown greedily and recorded; sensor noise is the same each time."""
-        self._rollouts_compiled.result()
+        programs = self._flights_compiled.result()
         placed = self._placed(missions, params, agent)
         recorded = rollouts.Extras(record=True)
 
@@ -150,7 +154,9 @@ class TrainingSetup:
             self.display.count(agent * count + ended, len(self.configs) * count)
 
         return processes.fetch_global(
-            rollouts.fly_missions(self.config, *placed, extras=recorded, mesh=self.mesh, tell=tell)
+            rollouts.fly_missions(
+                self.config, *placed, extras=recorded, mesh=self.mesh, tell=tell, programs=programs
+            )
         )
 
     def _shortest(self) -> ShortestPath:
@@ -213,17 +219,15 @@ def set_up_training(
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _in_background(pool: Executor, work: Callable[[], object], began: float) -> Future[float]:
-    """Runs `work` in a thread; the future holds the seconds since the time `began`.
-
-    Of several processes none works ahead: all must meet in one order.
-    """
-
-    def timed() -> float:
-        work()
-        return time.perf_counter() - began
-
-    future = pool.submit(timed)
+def _in_background(pool: Executor, work: Callable[[], Made]) -> Future[Made]:
+    """Runs `work` in a thread. Of several processes none works ahead: all must meet in one order."""
+    future = pool.submit(work)
     if jax.process_count() > 1:
         future.result()
     return future
+
+
+def _timed(work: Callable[[], object], began: float) -> float:
+    """Does `work` and returns the seconds since the time `began`."""
+    work()
+    return time.perf_counter() - began

@@ -186,13 +186,13 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     layout = NamedSharding(mesh, PartitionSpec())
     world, params = jax.device_put((course.env_params, always((1, 0, 0))), layout)
     key = jax.random.key(0)
-    for program in rollouts.trace_missions(CONFIG, world, params, key, record=True, mesh=mesh):
-        program.compile()
+    options: Any = {"extras": Extras(record=True), "mesh": mesh}
+    options["programs"] = rollouts.trace_missions(CONFIG, world, params, key, **options)()
     another_key = jax.random.key(1)
     compiled: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event))
-    flown = fly_missions(CONFIG, world, params, key, extras=Extras(record=True), mesh=mesh)
-    fly_missions(CONFIG, world, params, another_key, extras=Extras(record=True), mesh=mesh)
+    flown = fly_missions(CONFIG, world, params, key, **options)
+    fly_missions(CONFIG, world, params, another_key, **options)
     jax.monitoring.clear_event_listeners()
     assert "/jax/core/compile/backend_compile_duration" not in compiled
     mission = int(np.flatnonzero(np.asarray(flown.outcome) == Outcome.COLLISION)[0])

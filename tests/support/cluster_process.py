@@ -88,7 +88,7 @@ if __name__ == "__main__":
         del argv[0]
         Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self: None, no_learning
         Trainer.trace = lambda self: None
-        rollouts.trace_missions = lambda *_, **__: []
+        rollouts.trace_missions = lambda *_, **__: lambda: None
     code = main(["train", *argv])
     Path(note).write_text(json.dumps(to_plain_json(noted)), encoding="utf-8")
     sys.exit(code)

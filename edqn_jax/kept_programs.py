@@ -1,0 +1,189 @@
+"""Programs that a command compiled, loaded by a later one without being traced.
+
+JAX's own cache is asked with a traced program, and tracing is most of what a second run would wait for. Here a program
+is found by what it is traced from: the configuration, shapes and layout of its arguments, the package's sources, and
+versions and settings of what traces and compiles it. With code of users in the process nothing is kept, since that is
+not among them.
+
+The files hold pickles, so the folder is one in which nobody else can write (`cache.private_folder`), as for JAX's cache.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import os
+import pickle
+import platform
+import threading
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+from jax.experimental import serialize_executable
+
+from edqn_jax import user_code
+from edqn_jax.config import Config, registry
+from edqn_jax.devices.cache import enabled_folder
+from edqn_jax.devices.kept_files import name_of, read_kept, write_kept
+from edqn_jax.native import build, shipped
+from edqn_jax.registries import Registry
+
+PACKAGE = Path(__file__).parent
+
+SOURCES = (".c", ".cu", ".h", ".py")
+
+DEPENDENCIES = ("flax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax")
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where programs are found that belong together. They lie beside it, by what XLA compiles them from.
+
+    So what one configuration or version of the package has compiled is found by another that leads to the same program.
+    """
+
+    file: Path | None
+    """None if they are not kept."""
+
+    def holds_programs(self) -> bool:
+        """Returns whether programs are found here."""
+        return self.file is not None and self.file.is_file()
+
+    def load(self) -> list[jax.stages.Compiled] | None:
+        """Returns the programs; None if there are none, or they cannot be loaded, and are to be compiled."""
+        content = None if self.file is None else read_kept(self.file)
+        if content is None or self.file is None:
+            return None
+        try:
+            libraries, programs = pickle.loads(content)
+            if not all(build.ensure_registered(*_arguments(library)) for library in libraries):
+                return None
+            loaded = [_load(self.file.parent / name, *others) for name, *others in programs]
+        except Exception:  # whatever is wrong with what another version has written, they are compiled
+            return None
+        return None if None in loaded else loaded
+
+    def compile(
+        self,
+        traced: Sequence[jax.stages.Lowered],
+        devices: Sequence[Any],
+        options: Mapping[str, str | bool] | None = None,
+    ) -> list[jax.stages.Compiled]:
+        """Compiles programs for these devices, unless the same were compiled before, and keeps them if possible.
+
+        Args:
+            traced: each of them.
+            devices: on which they run.
+            options: of the compiler.
+        """
+        if self.file is None:
+            return [each.compile(options) for each in traced]
+        numbers, compiled, found = [device.id for device in devices], [], []
+        for each in traced:
+            texts = each.as_text(), repr((sorted((options or {}).items()), numbers)), *_surroundings()
+            name = f"{name_of(*(text.encode() for text in texts))}.executable"
+            trees = jax.tree.structure(each.args_info), each.out_tree
+            program = _load(self.file.parent / name, *trees, numbers)
+            if program is None:
+                program = _compile_and_keep(self.file.parent / name, each, options)
+            compiled.append(program)
+            found.append((name, *trees, numbers))
+        if not all((self.file.parent / name).is_file() for name, *_ in found):
+            return compiled
+        with contextlib.suppress(Exception):  # of trees that hold what cannot be pickled
+            write_kept(self.file, pickle.dumps((build.used_libraries(), found)))
+        return compiled
+
+
+def _load(file: Path, in_tree: Any, out_tree: Any, numbers: Sequence[int]) -> jax.stages.Compiled | None:
+    content, devices = read_kept(file), jax.devices()
+    if content is None:
+        return None
+    devices = [devices[number] for number in numbers]
+    return serialize_executable.deserialize_and_load(content, in_tree, out_tree, execution_devices=devices)
+
+
+def _compile_and_keep(
+    file: Path, traced: jax.stages.Lowered, options: Mapping[str, str | bool] | None
+) -> jax.stages.Compiled:
+    hits = _hits_of_thread()
+    compiled = traced.compile(options)
+    if _hits_of_thread() == hits:  # what XLA has loaded itself from JAX's cache it writes without its functions
+        with contextlib.suppress(Exception):  # such as of a program that calls Python
+            write_kept(file, serialize_executable.serialize(compiled)[0])
+    return compiled
+
+
+_of_thread = threading.local()
+
+
+def _hits_of_thread() -> int:
+    """Returns how many programs this thread has had from JAX's cache since it was first asked."""
+    _listen()
+    return getattr(_of_thread, "hits", 0)
+
+
+@functools.cache
+def _listen() -> None:
+    def count(event: str, **_: Any) -> None:
+        if event == "/jax/compilation_cache/cache_hits":
+            _of_thread.hits = getattr(_of_thread, "hits", 0) + 1
+
+    jax.monitoring.register_event_listener(count)
+
+
+def place_of(name: str, made_of: object, arguments: Any) -> Place:
+    """Returns where programs are kept.
+
+    Args:
+        name: of the programs.
+        made_of: what they are traced from beside their arguments; its `repr` tells it apart.
+        arguments: of the first, arrays or their shapes in a tree.
+    """
+    folder = enabled_folder()
+    if folder is None or jax.process_count() > 1 or _has_user_code():
+        return Place(None)
+    leaves, form = jax.tree.flatten(arguments)
+    parts = [name, repr(made_of), str(form), *map(_shape_of, leaves)]
+    if any(" at 0x" in part for part in parts):  # an object that nothing but its address tells apart
+        return Place(None)
+    parts += [_digest_of_package(), str(PACKAGE), *_surroundings()]
+    return Place(folder / f"{name}-{name_of(*(part.encode() for part in parts))}.program")
+
+
+def without_seed(config: Config) -> Config:
+    """Returns a configuration whose programs are those of all seeds, which are arguments of what is traced."""
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, seed=0))
+
+
+def _has_user_code() -> bool:
+    own = (entries.own for entries in vars(registry).values() if isinstance(entries, Registry))
+    return bool(user_code.IMPORTED) or any(own)
+
+
+def _shape_of(leaf: Any) -> str:
+    return f"{leaf.dtype}{leaf.shape} {getattr(leaf, 'weak_type', False)} {getattr(leaf, 'sharding', None)}"
+
+
+def _arguments(library: build.Library) -> tuple[Any, ...]:
+    return tuple(getattr(library, field.name) for field in dataclasses.fields(library))
+
+
+def _surroundings() -> tuple[str]:
+    """Returns what decides how programs are compiled, and how they are traced beside the package's sources."""
+    settings = {name: value for name, value in os.environ.items() if name.startswith(("JAX_", "XLA_"))}
+    compilers = [build.compiler_version(), os.environ.get(shipped.SWITCH)]
+    devices = [(device.platform, device.device_kind, device.id) for device in jax.devices()]
+    versions = [platform.python_version(), *map(metadata.version, DEPENDENCIES)]
+    return (repr((sorted(settings.items()), compilers, devices, versions)),)
+
+
+@functools.cache
+def _digest_of_package() -> str:
+    files = sorted(file for file in PACKAGE.rglob("*") if file.suffix in SOURCES)
+    return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()

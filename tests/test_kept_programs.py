@@ -1,0 +1,137 @@
+"""Programs that a later process loads without tracing them, and what they must not be mistaken for."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from edqn_jax import kept_programs, user_code
+from edqn_jax.config import registry
+from edqn_jax.devices import cache
+from edqn_jax.kept_programs import Place, place_of
+
+ARGUMENTS = (jnp.arange(3.0), {"keys": jax.random.split(jax.random.key(0), 2)})
+
+COMMAND = """
+import sys
+import jax, jax.numpy as jnp
+from pathlib import Path
+from edqn_jax.devices.cache import enable_compilation_cache
+from edqn_jax.devices.devices import use_cpu_devices
+use_cpu_devices(2)
+enable_compilation_cache()
+from edqn_jax.kept_programs import place_of
+from edqn_jax.native import products
+
+def program(x, keys):
+    print("traced")
+    square = x[:, None] * x
+    return products.rounded_matmul(square, square), jax.random.split(keys[0])
+
+arguments = jnp.arange(32.0), jax.random.split(jax.random.key(0), 2)
+place = place_of("squares", sys.argv[1], arguments)
+[compiled] = place.load() or [None]
+if compiled is None:
+    [compiled] = place.compile([jax.jit(program).lower(*arguments)], jax.devices()[:1])
+squares, keys = compiled(*arguments)
+print(float(squares.sum()), jax.random.key_data(keys).tolist())
+"""
+
+
+def lines_of(folder: Path, made_of: str = "one", **variables: str) -> list[str]:
+    """Returns what a process prints that compiles a program, or loads it."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "XDG_"))}
+    environment = kept | {"XDG_CACHE_HOME": str(folder)} | variables
+    done = subprocess.run([sys.executable, "-c", COMMAND, made_of], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
+
+
+@pytest.mark.slow
+def test_a_program_is_traced_once_and_damaged_ones_again(tmp_path: Path) -> None:
+    [traced, result] = lines_of(tmp_path)
+    assert traced == "traced" and lines_of(tmp_path) == [result]
+    for _ in range(2):  # the same program, from elsewhere
+        assert lines_of(tmp_path, "another")[-1] == result
+    [program], places = tmp_path.rglob("*.executable"), sorted(tmp_path.rglob("*.program"))
+    assert len(places) == 2 and lines_of(tmp_path, "another") == [result]
+    for file in (program, *places):
+        file.write_bytes(file.read_bytes()[:-20])
+        assert lines_of(tmp_path) == ["traced", result]
+    assert lines_of(tmp_path, EDQN_JAX_NATIVE="0")[0] == "traced"
+
+
+def test_what_jax_has_kept_is_not_kept_again_and_runs(tmp_path: Path) -> None:
+    """XLA writes a program that it has loaded itself without its functions, so that it could not be run."""
+    [_, result] = lines_of(tmp_path)
+    for file in [*tmp_path.rglob("*.executable"), *tmp_path.rglob("*.program")]:
+        file.unlink()
+    for _ in range(2):
+        assert lines_of(tmp_path)[-1] == result
+    assert not list(tmp_path.rglob("*.executable")) + list(tmp_path.rglob("*.program"))
+
+
+@pytest.fixture
+def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """The folder in which this process keeps programs, for the time of a test."""
+    monkeypatch.setattr(cache, "_enabled", [tmp_path])
+    return tmp_path
+
+
+def place(made_of: object = "one", arguments: Any = ARGUMENTS) -> Place:
+    return place_of("program", made_of, arguments)
+
+
+def test_programs_are_told_apart_by_what_they_are_made_of(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    values, keys = ARGUMENTS
+    others = [
+        place("two"),
+        place(arguments=(values[1:], keys)),
+        place(arguments=(values.astype(jnp.int32), keys)),
+        place(arguments=(values, keys["keys"])),
+    ]
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+    others.append(place())
+    monkeypatch.undo()
+    monkeypatch.setattr(cache, "_enabled", [folder])
+    monkeypatch.setattr(kept_programs, "_digest_of_package", lambda: "of an earlier version")
+    others.append(place())
+    monkeypatch.undo()
+    monkeypatch.setattr(cache, "_enabled", [folder])
+    assert place() == place(arguments=jax.tree.map(jnp.ones_like, (values, keys)) and ARGUMENTS)
+    assert len({each.file for each in [place(), *others]}) == 7
+
+
+def test_nothing_is_kept_beside_code_of_users(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert place().file is not None
+    assert place(made_of=[lambda: None]) == Place(None)
+    with monkeypatch.context() as patch:
+        patch.setattr(user_code, "IMPORTED", ["mine.py"])
+        assert place() == Place(None)
+    monkeypatch.setitem(registry.SENSORS._entries, "mine", object())
+    assert place() == Place(None)
+
+
+def test_nothing_is_kept_unless_a_command_has_asked_for_it(tmp_path: Path) -> None:
+    nowhere = place()
+    assert nowhere == Place(None) and not nowhere.holds_programs() and nowhere.load() is None
+    [same] = nowhere.compile([jax.jit(lambda x: x).lower(1.0)], jax.devices()[:1])
+    assert same(2.0) == 2.0
+
+
+def test_a_program_that_calls_python_is_not_kept(folder: Path) -> None:
+    def ask(x: jax.Array) -> jax.Array:
+        return jax.pure_callback(lambda x: x, x, x)
+
+    here = place()
+    for _ in range(2):
+        [asking] = here.load() or here.compile([jax.jit(ask).lower(1.0)], jax.devices()[:1])
+        assert asking(2.0) == 2.0
+    assert not list(folder.glob("*.executable"))
