@@ -5,7 +5,7 @@ is found by what it is traced from: the configuration, shapes and layout of its 
 versions and settings of what traces and compiles it. With code of users in the process nothing is kept, since that is
 not among them.
 
-The files hold pickles, so the folder is one in which nobody else can write (`cache.private_folder`), as for JAX's cache.
+The files hold pickles, so nobody else can write in their folder (`cache.private_folder`), as in that of JAX's cache.
 """
 
 from __future__ import annotations
@@ -14,16 +14,18 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import inspect
 import os
 import pickle
 import platform
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import jax
+import numpy as np
 from jax.experimental import serialize_executable
 
 from edqn_jax import user_code
@@ -32,6 +34,9 @@ from edqn_jax.devices.cache import enabled_folder
 from edqn_jax.devices.kept_files import name_of, read_kept, write_kept
 from edqn_jax.native import build, shipped
 from edqn_jax.registries import Registry
+
+Given = ParamSpec("Given")
+Returned = TypeVar("Returned")
 
 PACKAGE = Path(__file__).parent
 
@@ -67,6 +72,30 @@ class Place:
         except Exception:  # whatever is wrong with what another version has written, they are compiled
             return None
         return None if None in loaded else loaded
+
+    def named(self, function: Callable[Given, Returned]) -> Callable[Given, Returned]:
+        """Returns the function with a name of its own, if it is kept.
+
+        JAX's cache tells programs apart by it; and one that XLA has loaded from there it writes without its functions,
+        so that it could be run and not kept.
+        """
+        if self.file is None:
+            return function
+
+        def named(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
+            return function(*args, **kwargs)
+
+        named.__name__ = f"kept_{self.file.name.partition('-')[0]}"
+        return named
+
+    def load_or_compile(
+        self,
+        trace: Callable[[], Sequence[jax.stages.Lowered]],
+        devices: Sequence[Any],
+        options: Mapping[str, str | bool] | None = None,
+    ) -> list[jax.stages.Compiled]:
+        """Returns the programs as `load`, or as `compile` does those that `trace` returns."""
+        return self.load() or self.compile(trace(), devices, options)
 
     def compile(
         self,
@@ -113,7 +142,7 @@ def _compile_and_keep(
 ) -> jax.stages.Compiled:
     hits = _hits_of_thread()
     compiled = traced.compile(options)
-    if _hits_of_thread() == hits:  # what XLA has loaded itself from JAX's cache it writes without its functions
+    if _hits_of_thread() == hits:  # see `Place.named`
         with contextlib.suppress(Exception):  # such as of a program that calls Python
             write_kept(file, serialize_executable.serialize(compiled)[0])
     return compiled
@@ -135,6 +164,51 @@ def _listen() -> None:
             _of_thread.hits = getattr(_of_thread, "hits", 0) + 1
 
     jax.monitoring.register_event_listener(count)
+
+
+class KeptFunction(Generic[Given, Returned]):
+    """A function as `jax.jit` makes it; where a command keeps programs, it is loaded without being traced."""
+
+    def __init__(self, function: Callable[Given, Returned], static_argnums: tuple[int, ...]) -> None:
+        functools.update_wrapper(self, function)
+        self._static, self._signature = static_argnums, inspect.signature(function)
+        self._function, self._traced = function, jax.jit(function, static_argnums=static_argnums)
+        self._compiled: dict[Any, jax.stages.Compiled] = {}
+        self._one_at_a_time = threading.Lock()
+
+    def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> Returned:
+        bound = self._signature.bind(*args, **kwargs)
+        bound.apply_defaults()
+        args = bound.args  # one program, however the arguments are given
+        if enabled_folder() is None:
+            return self._traced(*args)
+        given = [arg for number, arg in enumerate(args) if number not in self._static]
+        leaves, form = jax.tree.flatten(given)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+            return self._traced(*args)
+        static = tuple(arg for number, arg in enumerate(args) if number in self._static)
+        told_apart = static, form, tuple(map(_kind_of, leaves))
+        compiled = self._compiled.get(told_apart) or self._compile(told_apart, static, given, args)
+        return compiled(*given)
+
+    def _compile(self, told_apart: Any, static: Any, given: Any, args: Any) -> jax.stages.Compiled:
+        with self._one_at_a_time:
+            if told_apart not in self._compiled:
+                place = place_of(self.__name__.strip("_"), (self.__module__, self._static, static), given)
+                function = jax.jit(place.named(self._function), static_argnums=self._static)
+                [self._compiled[told_apart]] = place.load_or_compile(
+                    lambda: [function.lower(*args)], jax.local_devices()[:1]
+                )
+            return self._compiled[told_apart]
+
+
+def kept_jit(*static_argnums: int) -> Callable[[Callable[Given, Returned]], KeptFunction[Given, Returned]]:
+    """Returns a decorator like `jax.jit`, for what every command computes a few times, on the first device.
+
+    Args:
+        static_argnums: places of arguments that are static, told apart by their `repr`.
+    """
+    return lambda function: KeptFunction(function, static_argnums)
 
 
 def place_of(name: str, made_of: object, arguments: Any) -> Place:
@@ -166,8 +240,16 @@ def _has_user_code() -> bool:
     return bool(user_code.IMPORTED) or any(own)
 
 
+def _kind_of(leaf: Any) -> Any:
+    """Returns what tells an argument apart within a process, sooner than `_shape_of`."""
+    if isinstance(leaf, jax.Array):
+        return leaf.aval, leaf.sharding
+    return (leaf.shape, leaf.dtype) if isinstance(leaf, np.ndarray | np.generic) else type(leaf)
+
+
 def _shape_of(leaf: Any) -> str:
-    return f"{leaf.dtype}{leaf.shape} {getattr(leaf, 'weak_type', False)} {getattr(leaf, 'sharding', None)}"
+    kind = leaf if isinstance(leaf, jax.ShapeDtypeStruct) else jax.typeof(leaf)
+    return f"{kind.dtype}{kind.shape} {kind.weak_type} {getattr(leaf, 'sharding', None)}"
 
 
 def _arguments(library: build.Library) -> tuple[Any, ...]:
@@ -179,8 +261,12 @@ def _surroundings() -> tuple[str]:
     settings = {name: value for name, value in os.environ.items() if name.startswith(("JAX_", "XLA_"))}
     compilers = [build.compiler_version(), os.environ.get(shipped.SWITCH)]
     devices = [(device.platform, device.device_kind, device.id) for device in jax.devices()]
-    versions = [platform.python_version(), *map(metadata.version, DEPENDENCIES)]
-    return (repr((sorted(settings.items()), compilers, devices, versions)),)
+    return (repr((sorted(settings.items()), compilers, devices, _versions())),)
+
+
+@functools.cache
+def _versions() -> list[str]:
+    return [platform.python_version(), *map(metadata.version, DEPENDENCIES)]
 
 
 @functools.cache

@@ -35,8 +35,12 @@ from edqn_jax.runs.continuation import find_run, resume_config
 from edqn_jax.runs.directory import Resume, RunDirectory, plan_run_directory
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from edqn_jax.interop import tracking
     from edqn_jax.learn.policy import Policy
+    from edqn_jax.runs.record import Draw
+    from edqn_jax.sim.scene.scene import Scene
     from edqn_jax.training.progress import Progress
 
 
@@ -204,6 +208,13 @@ def _parse_config(argv: Sequence[str], base: Config) -> Config:
     return parse_or_say(lambda: tyro.cli(TrainCommand, args=argv, prog=TRAIN, default=begins), TRAIN).config
 
 
+def _prepare_gallery(config: Config, scene: Scene, pool: Executor) -> Draw:
+    """Does `report.gallery.prepare_gallery`, whose imports take a second, once there is something to draw."""
+    from edqn_jax.report.gallery import prepare_gallery
+
+    return prepare_gallery(config, scene, pool)
+
+
 def train_command(argv: Sequence[str], stops: Stops) -> None:
     """Runs `edqn train` with these arguments.
 
@@ -225,7 +236,6 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     from edqn_jax.devices.cache import enable_compilation_cache
     from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
     from edqn_jax.devices.hardware import count_cores
-    from edqn_jax.report.gallery import prepare_gallery
     from edqn_jax.runs.policies import load_policy
     from edqn_jax.runs.stopping import Stop
 
@@ -256,7 +266,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     try:
         from edqn_jax.runs.record import train_run
 
-        others = {"drawing": prepare_gallery, "seeds": options.seeds, "start": start}
+        others = {"drawing": _prepare_gallery, "seeds": options.seeds, "start": start}
         train_run(config, run, progress, stop, callback=sinks, **others)
     except jax.errors.JaxRuntimeError as error:
         if arguments is None:

@@ -10,7 +10,6 @@ all methods together.
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import trim_mean
 
 from edqn_jax.evaluation.metrics import wilson_interval
 
@@ -19,6 +18,8 @@ DRAWS = 10_000
 
 def interquartile_mean(values: np.ndarray) -> float:
     """Returns the mean of the middle half of values [N] (Agarwal et al. 2021); of fewer than four, of all of them."""
+    from scipy.stats import trim_mean  # takes most of a second to import
+
     return float(trim_mean(np.asarray(values, float), 0.25))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.places import Point, check_seed, moved_ends, place_in_file
+from edqn_jax.kept_programs import kept_jit
 from edqn_jax.keys import CROSSING_OF_WORLD, FILE_MISSIONS, run_streams
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.planning.free_space import find_reachable, is_reachable
@@ -29,6 +30,8 @@ from edqn_jax.sim.task.reward import Reward, check_reward
 from edqn_jax.sim.worlds import families
 from edqn_jax.sim.worlds.free_points import Cells, cells_of, free_point
 
+_scene_of = kept_jit()(scene_of)  # one program, not one for each shape of array
+
 
 @dataclasses.dataclass(frozen=True)
 class MissionSet:
@@ -44,7 +47,7 @@ class MissionSet:
 
     def scene(self, mission: int = 0) -> Scene:
         """Returns the world of one mission."""
-        return scene_of(self.env_params, jnp.asarray(mission))
+        return _scene_of(self.env_params, jnp.asarray(mission))
 
     def with_reward(self, reward: Reward | None) -> MissionSet:
         """Returns the same missions with this reward; None is the configured one.
@@ -190,7 +193,7 @@ def _env_params_of(pool: Scene, config: Config, split: families.Split, first: in
 
 def _prepend(own: Scene, pool: Scene) -> Scene:
     """Returns a pool with the world `own`, a pool of one, before all others, and without its last."""
-    return jax.tree.map(lambda one, many: jnp.asarray(np.concatenate([one, many])[:-1]), own, pool)
+    return jax.tree.map(lambda one, many: jax.device_put(np.concatenate([one, many])[:-1]), own, pool)
 
 
 def _training_missions(pool: Scene, config: Config, key: jax.Array) -> Missions:

@@ -19,8 +19,8 @@ from edqn_jax.config import Config
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import decoder
+from edqn_jax.kept_programs import Place, place_of, without_seed
 from edqn_jax.keys import run_streams
-from edqn_jax.kept_programs import place_of, without_seed
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task import group
@@ -183,35 +183,42 @@ def fly_on_all_devices(
     key = run_streams(seed).flights
     options: Any = {"extras": Extras(record, shuffle_codes, decoder_errors), "mesh": mesh}
     is_agent = actor is None or actor == AgentActor(config)
-    programs = trace_missions(config, env_params, params, key, **options)() if is_agent else None
+    programs = trace_missions(config, env_params, lambda: params, key, **options)() if is_agent else None
     flights = fly_missions(config, env_params, params, key, actor=actor, tell=tell, programs=programs, **options)
     return jax.tree.map(np.asarray, flights)
 
 
 def trace_missions(
-    config: Config, env_params: EnvParams, params: Any, key: Array, *, extras: Extras, mesh: Mesh
+    config: Config, env_params: EnvParams, params: Callable[[], Any], key: Array, *, extras: Extras, mesh: Mesh
 ) -> Callable[[], Programs]:
     """Returns a function that compiles what `fly_missions` runs for the agent, or loads it where it is kept.
 
     Tracing is done here, so that the function has little left to do in Python.
+
+    Args:
+        config: as of `fly_missions`, and so on.
+        env_params: the missions.
+        params: returns parameters of the shapes and layout of those that will fly; asked for what is to be traced.
+        key: of the flights.
+        extras: recording and measuring.
+        mesh: devices.
     """
     program = _Program(config, AgentActor(config), extras)
-    arguments = env_params, params, key
     told_apart = without_seed(config), extras, [device.id for device in mesh.devices.flat]
-    place = place_of("flights", told_apart, arguments)
-    traced = None if place.holds_programs() else _lower(program, mesh, *arguments)
+    place = place_of("flights", told_apart, (env_params, key))
+    traced = None if place.holds_programs() else _lower(place, program, mesh, env_params, params(), key)
 
     def compile_all() -> Programs:
-        compiled = place.load()
-        if compiled is None:
-            compiled = place.compile(traced or _lower(program, mesh, *arguments), [*mesh.devices.flat])
-        return Programs(*map(_without_static, compiled))
+        trace = lambda: traced or _lower(place, program, mesh, env_params, params(), key)  # noqa: E731
+        return Programs(*map(_without_static, place.load_or_compile(trace, [*mesh.devices.flat])))
 
     return compile_all
 
 
-def _lower(program: _Program, mesh: Mesh, env_params: EnvParams, params: Any, key: Array) -> list[jax.stages.Lowered]:
-    begin, fly_on, end = _programs(mesh)
+def _lower(
+    place: Place, program: _Program, mesh: Mesh, env_params: EnvParams, params: Any, key: Array
+) -> list[jax.stages.Lowered]:
+    begin, fly_on, end = _programs(mesh, named=place.named)
     first = begin.trace(program, env_params, params, key)
     flying = jax.tree.map(
         lambda leaf, layout: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=layout),
@@ -237,15 +244,22 @@ def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
 
 
 @functools.cache
-def _programs(mesh: Mesh | None, options: tuple[tuple[str, str | bool], ...] | None = None) -> Programs:
-    """Returns what flies on the devices of a mesh, compiled with the platform's options, or with others."""
+def _programs(
+    mesh: Mesh | None,
+    options: tuple[tuple[str, str | bool], ...] | None = None,
+    named: Callable[[Callable[..., Any]], Callable[..., Any]] = lambda function: function,
+) -> Programs:
+    """Returns what flies on the devices of a mesh, compiled with the platform's options, or with others.
+
+    `named` gives functions the names of their programs.
+    """
     platform = (jax.devices()[0] if mesh is None else mesh.devices.flat[0]).platform
     compiled = partial(jax.jit, compiler_options=compiler_options(platform) if options is None else dict(options))
     # Static by position: an argument passed by name would compile another program.
     return Programs(
-        begin=compiled(partial(_begin_all, mesh), static_argnums=0),
-        fly_on=compiled(partial(_fly_on_all, mesh), static_argnums=0, donate_argnums=3),
-        end=compiled(partial(_end_all, mesh), static_argnums=0),
+        begin=compiled(named(partial(_begin_all, mesh)), static_argnums=0),
+        fly_on=compiled(named(partial(_fly_on_all, mesh)), static_argnums=0, donate_argnums=3),
+        end=compiled(named(partial(_end_all, mesh)), static_argnums=0),
     )
 
 

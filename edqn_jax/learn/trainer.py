@@ -20,8 +20,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
-from edqn_jax.keys import run_streams
 from edqn_jax.kept_programs import Place, place_of, without_seed
+from edqn_jax.keys import run_streams
 from edqn_jax.learn.checked import CheckedChunk
 from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.policy import Policy
@@ -94,9 +94,8 @@ class Trainer:
         keys = [run_streams(number).learning for number in ([seed] if isinstance(seed, int) else seed)]
         arguments = self.env_params, keys[0] if self.agents is None else jnp.stack(keys)
         place = Place(None) if start is not None else self._place_of("first_state", arguments)
-        [make] = place.load() or [None]
-        if make is None:
-            [make] = place.compile([jax.jit(self._each(begin, 0)).lower(*arguments)], [*self.mesh.devices.flat])
+        function = jax.jit(place.named(self._each(begin, 0)))
+        [make] = place.load_or_compile(lambda: [function.lower(*arguments)], [*self.mesh.devices.flat])
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
         return jax.jit(lambda state: state, out_shardings=self._layout())(make(*arguments))
 
@@ -116,15 +115,19 @@ class Trainer:
         return TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
 
     def shapes(self) -> TrainState:
-        """Returns shape, type and layout of every array of a state, which takes half a second once."""
+        """Returns shape, type and layout of every array of a state, which takes some seconds where no chunk is kept."""
         if self._shapes is None:
             self._shapes = self._shaped()
         return self._shapes
 
     def _shaped(self) -> TrainState:
-        key = jax.random.key(0)
-        keys = key if self.agents is None else jax.random.split(key, self.agents)
-        shapes = jax.eval_shape(self._each(partial(init_state, self.config), 0), self.env_params, keys)
+        self._load()
+        if self._chunk is not None:
+            shapes = self._chunk.args_info[0][1]
+        else:
+            key = jax.random.key(0)
+            keys = key if self.agents is None else jax.random.split(key, self.agents)
+            shapes = jax.eval_shape(self._each(partial(init_state, self.config), 0), self.env_params, keys)
         layout = self._layout()
         return TrainState(
             actors=_with_sharding(shapes.actors, layout.actors),
@@ -145,12 +148,11 @@ class Trainer:
             self._chunk = CheckedChunk(self.config, run, self.env_params, self.shapes(), self._steps(0))
             return
         self.trace()
-        assert self._place is not None
-        [self._chunk] = self._place.load() or [None]
-        if self._chunk is None:
-            traced = self._traced or self._lower()
-            devices = [*self.mesh.devices.flat]
-            [self._chunk] = self._place.compile([traced], devices, compiler_options(devices[0].platform))
+        if self._chunk is not None:
+            return
+        assert self._place is not None and self._traced is not None
+        devices = [*self.mesh.devices.flat]
+        [self._chunk] = self._place.compile([self._traced], devices, compiler_options(devices[0].platform))
         self._traced = None
 
     def trace(self) -> None:
@@ -158,11 +160,17 @@ class Trainer:
 
         Does nothing with `train.debug`.
         """
-        if self.config.train.debug or self._place is not None:
+        if self.config.train.debug:
             return
-        self._place = self._place_of("training", self._arguments())
-        if not self._place.holds_programs():
+        self._load()
+        if self._chunk is None and self._traced is None:
             self._traced = self._lower()
+
+    def _load(self) -> None:
+        """Loads the chunk if it is kept. The shapes of states follow from the configuration, and need not be known."""
+        if self._place is None and not self.config.train.debug:
+            self._place = self._place_of("training", (self.env_params, self._steps(0)))
+            [self._chunk] = self._place.load() or [None]
 
     def _place_of(self, name: str, arguments: Any) -> Place:
         """Returns where a program of this trainer is kept; nowhere if it may hold what is in a teacher's files."""
@@ -170,9 +178,6 @@ class Trainer:
             return Place(None)
         devices = [device.id for device in self.mesh.devices.flat]
         return place_of(name, (without_seed(self.config), self.agents, devices), arguments)
-
-    def _arguments(self) -> tuple[EnvParams, TrainState, Array]:
-        return self.env_params, self.shapes(), self._steps(0)
 
     def _lower(self) -> jax.stages.Lowered:
         # One spec for each subtree: only environments and replay are spread, and what they return.
@@ -187,7 +192,8 @@ class Trainer:
             out_specs=(specs, (self._spread(None), same)),
             check_vma=False,
         )
-        return jax.jit(run, donate_argnums=1).lower(*self._arguments())
+        assert self._place is not None
+        return jax.jit(self._place.named(run), donate_argnums=1).lower(self.env_params, self.shapes(), self._steps(0))
 
     def _steps(self, first: int) -> Array:
         numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)

@@ -15,6 +15,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.kept_programs import kept_jit
 from edqn_jax.planning.path import point_text
 from edqn_jax.sim.scene.distance import segment_contact, signed_distance
 from edqn_jax.sim.scene.scene import Scene
@@ -183,15 +184,15 @@ def touches_on_leg(scene: Scene, start: Array, end: Array, radius: Array, stride
     return free < 0
 
 
-_touches_on_leg = jax.jit(touches_on_leg)
+_touches_on_leg = kept_jit()(touches_on_leg)
 
 
-@jax.jit
+@kept_jit()
 def _signed_distances(scene: Scene, points: Array) -> Array:
     return jax.vmap(lambda point: signed_distance(scene, point))(points)
 
 
-@jax.jit
+@kept_jit()
 def _touches(scene: Scene, ends: Array, radius: Array) -> Array:
     return jax.vmap(lambda pair: segment_contact(scene, pair[:3], pair[3:], radius)[0])(ends)
 

@@ -19,6 +19,7 @@ from edqn_jax.config import Config
 from edqn_jax.devices.devices import quick_compiler_options
 from edqn_jax.evaluation.decoder import metres_of, predicted_distance
 from edqn_jax.evaluation.trajectories import ATTITUDE, POSITION, VELOCITY, actions_of, columns_of, directions
+from edqn_jax.kept_programs import place_of, without_seed
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import fresh_policy
@@ -115,7 +116,7 @@ class FlightRenderer:
         looks = len(sensor.frame_steps(config))
         params = jax.eval_shape(lambda: fresh_policy(config)) if self._decodes else None
         motion = jax.ShapeDtypeStruct((observations, MOTION_SIZE), np.float32)
-        return _compiled(self._all_shown, self.scene, params, *_blank_poses(observations, looks), motion)
+        return self._compiled("sights", self._all_shown, self.scene, params, *_blank_poses(observations, looks), motion)
 
     def _all_shown(
         self, scene: Scene, params: PolicyParams | None, position: Array, quaternion: Array, time: Array, motion: Array
@@ -161,7 +162,12 @@ class FlightRenderer:
             rotation = sensor.mount_rotation(self.config, quaternion)
             return camera.fine_rgb(self.config.camera, FINE, scene_at(scene, time), position, rotation)
 
-        return _compiled(picture, self.scene, *_blank_poses())
+        return self._compiled("rgb", picture, self.scene, *_blank_poses())
+
+    def _compiled(self, name: str, program: Any, *arguments: Any) -> Compiled:
+        place = place_of(name, (without_seed(self.config), self._decodes), arguments)
+        function, options = jax.jit(place.named(program)), quick_compiler_options(jax.default_backend())
+        return place.load_or_compile(lambda: [function.lower(*arguments)], jax.local_devices()[:1], options)[0]
 
 
 def decision_rows(config: Config, trajectory: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -226,10 +232,6 @@ def own_motions(config: Config, trajectory: Mapping[str, np.ndarray], rows: np.n
     after = Flight(jnp.asarray(place), jnp.asarray(now), velocity)
     commanded = directions(config, after, actions_of(trajectory)[last])
     return np.asarray(jnp.concatenate([ahead, rate[:, None], commanded], axis=-1), np.float32)
-
-
-def _compiled(program: Any, *arguments: Any) -> Compiled:
-    return jax.jit(program).lower(*arguments).compile(quick_compiler_options(jax.default_backend()))
 
 
 def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, ...]:

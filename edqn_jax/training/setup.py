@@ -31,7 +31,7 @@ from edqn_jax.learn.trainer import Trainer
 from edqn_jax.learn.updates import check_begins
 from edqn_jax.planning.astar import Path as ShortestPath
 from edqn_jax.planning.astar import shortest_path
-from edqn_jax.sim.task.env import EnvParams, check_sensor
+from edqn_jax.sim.task.env import check_sensor
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward, check_reward
 from edqn_jax.sim.worlds import geodesic
@@ -39,6 +39,7 @@ from edqn_jax.training.learner_check import check_learner
 from edqn_jax.user_code import describe_object
 
 Made = TypeVar("Made")
+Tree = TypeVar("Tree")
 
 
 class Display(Protocol):
@@ -119,9 +120,11 @@ class TrainingSetup:
         began = time.perf_counter()
         self.trainer.trace()
         self._compiled = _in_background(pool, lambda: _timed(self.trainer.compile, began))
-        placed = self._placed(self.missions[0].validation, fresh_policy(self.config), 0)
+        world, key = self._placed(self.missions[0].validation.env_params), run_streams(config.train.seed).flights
         compile_flights = rollouts.trace_missions(
-            self.config, *placed, extras=rollouts.Extras(record=True), mesh=self.mesh
+            *(config, world, lambda: self._placed(fresh_policy(config)), key),
+            extras=rollouts.Extras(record=True),
+            mesh=self.mesh,
         )
         self._flights_compiled = _in_background(pool, compile_flights)
         self._first: TrainState | None = None
@@ -147,7 +150,8 @@ class TrainingSetup:
     def fly(self, missions: MissionSet, params: PolicyParams, agent: int = 0) -> Flights:
         """Returns the missions, flown greedily and recorded; sensor noise is the same each time."""
         programs = self._flights_compiled.result()
-        placed = self._placed(missions, params, agent)
+        world, params = self._placed((missions.env_params, params))
+        key = run_streams(self.configs[agent].train.seed).flights
         recorded = rollouts.Extras(record=True)
 
         def tell(ended: int, count: int) -> None:  # the agents fly one after the other
@@ -155,7 +159,7 @@ class TrainingSetup:
 
         return processes.fetch_global(
             rollouts.fly_missions(
-                self.config, *placed, extras=recorded, mesh=self.mesh, tell=tell, programs=programs
+                self.config, world, params, key, extras=recorded, mesh=self.mesh, tell=tell, programs=programs
             )
         )
 
@@ -163,12 +167,9 @@ class TrainingSetup:
         scene = self.missions[0].scene
         return shortest_path(scene, scene.start, scene.goal, self.config.drone.body_radius_m)
 
-    def _placed(
-        self, missions: MissionSet, params: PolicyParams, agent: int
-    ) -> tuple[EnvParams, PolicyParams, jax.Array]:
-        """World, parameters and key as `fly_missions` takes them."""
-        key = run_streams(self.configs[agent].train.seed).flights
-        return *processes.replicate((missions.env_params, params), self.mesh), key
+    def _placed(self, tree: Tree) -> Tree:
+        """Returns arrays as `fly_missions` takes them."""
+        return processes.replicate(tree, self.mesh)
 
 
 def config_for_reward(config: Config, reward: Reward | None) -> Config:

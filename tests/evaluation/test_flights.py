@@ -187,7 +187,7 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     world, params = jax.device_put((course.env_params, always((1, 0, 0))), layout)
     key = jax.random.key(0)
     options: Any = {"extras": Extras(record=True), "mesh": mesh}
-    options["programs"] = rollouts.trace_missions(CONFIG, world, params, key, **options)()
+    options["programs"] = rollouts.trace_missions(CONFIG, world, lambda: params, key, **options)()
     another_key = jax.random.key(1)
     compiled: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event))

@@ -11,6 +11,7 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 from edqn_jax.config.registry import SHAPES
+from edqn_jax.kept_programs import kept_jit
 from edqn_jax.sim.scene.scene import PARKED, Scene, has_motion, scene_at, speed_bounds
 
 
@@ -33,7 +34,7 @@ def shape_distances(scene: Scene, point: Array) -> dict[str, Array]:
     }
 
 
-distances_to_shapes = jax.jit(shape_distances)
+distances_to_shapes = kept_jit()(shape_distances)
 """`shape_distances` as one program, for what is asked on the host."""
 
 

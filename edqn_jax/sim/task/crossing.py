@@ -6,12 +6,11 @@ start, so straight ways meet near that point after about the same time.
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
+from edqn_jax.kept_programs import kept_jit
 from edqn_jax.sim.scene.scene import PARKED, Scene, take_scene
 from edqn_jax.sim.task.missions import Missions
 from edqn_jax.sim.worlds.free_points import ALTITUDES, CLEARANCE, FAR, TRIES, inner_bounds, least_distances
@@ -30,7 +29,7 @@ TURN = 0.5
 """How far a start may be turned about the common point at most, in shares of the angle between two."""
 
 
-@partial(jax.jit, static_argnames=("drones", "blocks"))
+@kept_jit(1, 2)
 def crossing_missions(pool: Scene, drones: int, blocks: int, key: Array) -> Missions:
     """Returns `blocks` x `drones` missions in random worlds of the pool [P]; each block is of one world.
 
@@ -45,7 +44,7 @@ def crossing_missions(pool: Scene, drones: int, blocks: int, key: Array) -> Miss
     return _in_worlds(pool, drones, index, jax.random.split(block_key, blocks))
 
 
-@partial(jax.jit, static_argnames="drones")
+@kept_jit(1)
 def own_crossings(pool: Scene, drones: int, keys: Array) -> Missions:
     """Returns one block of N = `drones` missions for each world of the pool [P], from `keys` [P], consumed."""
     return _in_worlds(pool, drones, jnp.arange(pool.start.shape[0]), keys)

@@ -10,6 +10,7 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
+from edqn_jax.kept_programs import kept_jit
 from edqn_jax.sim.scene.scene import Scene, take_scene
 from edqn_jax.sim.worlds.free_points import (
     CLEARANCE,
@@ -41,7 +42,7 @@ def own_missions(pool: Scene) -> Missions:
     return Missions(scene=jnp.arange(pool.start.shape[0]), start=pool.start, goal=pool.goal)
 
 
-@partial(jax.jit, static_argnames=("count", "own_goals"))
+@kept_jit(1, 3)
 def random_missions(pool: Scene, count: int, key: Array, own_goals: bool = False) -> Missions:
     """Returns missions in random worlds of the pool between random free points, as far apart as in `far_apart`.
 
@@ -65,7 +66,7 @@ def random_missions(pool: Scene, count: int, key: Array, own_goals: bool = False
     return jax.vmap(mission)(index, jax.random.uniform(points_key, (count, 2, TRIES, 3)))
 
 
-@partial(jax.jit, static_argnums=1)
+@kept_jit(1)
 def spread_missions(
     pool: Scene,
     count: int,

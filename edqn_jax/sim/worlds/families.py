@@ -17,6 +17,7 @@ from jax.typing import ArrayLike
 from edqn_jax.config import FAMILIES, MIXTURES, Config
 from edqn_jax.config.loading import suggest_nearest
 from edqn_jax.errors import ConfigError
+from edqn_jax.kept_programs import kept_jit
 from edqn_jax.keys import FAMILY_OF_WORLD, MOTION_OF_WORLD, RANDOM_WORLDS, uniform_integers
 from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene, with_equal_capacities
 from edqn_jax.sim.worlds import canyon, forest, open_worlds, rooms
@@ -260,7 +261,7 @@ def _set_in_motion(family: str, moving: Moving, scenes: Scene, keys: Array) -> S
     return _moved(family, moving, scenes, keys)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@kept_jit(0, 1)
 def _moved(family: str, moving: Moving, scenes: Scene, keys: Array) -> Scene:
     def one(scene: Scene, key: Array) -> Scene:
         return in_motion(scene, moving, _family(family).bodies, jax.random.fold_in(key, MOTION_OF_WORLD))
@@ -268,7 +269,7 @@ def _moved(family: str, moving: Moving, scenes: Scene, keys: Array) -> Scene:
     return jax.vmap(one)(scenes, keys)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(0)
 def _standing(family: str, keys: Array) -> tuple[Scene, Array]:
     """Returns static worlds, and whether each [P] has a path to the goal; one without is sampled again."""
     how, edge = _family(family), _family(family).edge_m

@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +17,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from edqn_jax.kept_programs import kept_jit
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.worlds.sweeps import spread, steps_aside
@@ -70,7 +70,7 @@ def distance_fields(pool: Scene, radius: float) -> Field:
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
 
 
-@partial(jax.jit, static_argnums=(1, 2))
+@kept_jit(1, 2)
 def _fields(pool: Scene, shape: tuple[int, int, int], radius: float) -> Field:
     return jax.vmap(lambda scene: _field(scene, shape, radius))(pool)
 

@@ -7,7 +7,6 @@ some of the `drawn` worlds each piece has its own.
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from typing import Any
 
 import jax
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import SurfaceConfig
+from edqn_jax.kept_programs import kept_jit
 from edqn_jax.keys import LOOK_OF_WORLD
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.scene.shapes.kind import PARKED
@@ -54,7 +54,7 @@ def with_looks(pool: Scene, keys: Array, config: SurfaceConfig) -> Scene:
     return pool if config.pattern == "plaid" else _add_looks(config, pool, keys)
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit(0)
 def _add_looks(config: SurfaceConfig, pool: Scene, keys: Array) -> Scene:
     def one(scene: Scene, key: Array) -> Scene:
         return _with_look(config, scene, jax.random.fold_in(key, LOOK_OF_WORLD))
