@@ -19,13 +19,14 @@ import os
 import pickle
 import platform
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import jax
 import numpy as np
+from jax.core import Tracer
 from jax.experimental import serialize_executable
 
 from edqn_jax import user_code
@@ -71,7 +72,8 @@ class Place:
             loaded = [_load(self.file.parent / name, *others) for name, *others in programs]
         except Exception:  # whatever is wrong with what another version has written, they are compiled
             return None
-        return None if None in loaded else loaded
+        found = [each for each in loaded if each is not None]
+        return found if len(found) == len(loaded) else None
 
     def named(self, function: Callable[Given, Returned]) -> Callable[Given, Returned]:
         """Returns the function with a name of its own, if it is kept.
@@ -92,7 +94,7 @@ class Place:
         self,
         trace: Callable[[], Sequence[jax.stages.Lowered]],
         devices: Sequence[Any],
-        options: Mapping[str, str | bool] | None = None,
+        options: dict[str, str | bool] | None = None,
     ) -> list[jax.stages.Compiled]:
         """Returns the programs as `load`, or as `compile` does those that `trace` returns."""
         return self.load() or self.compile(trace(), devices, options)
@@ -101,7 +103,7 @@ class Place:
         self,
         traced: Sequence[jax.stages.Lowered],
         devices: Sequence[Any],
-        options: Mapping[str, str | bool] | None = None,
+        options: dict[str, str | bool] | None = None,
     ) -> list[jax.stages.Compiled]:
         """Compiles programs for these devices, unless the same were compiled before, and keeps them if possible.
 
@@ -138,7 +140,7 @@ def _load(file: Path, in_tree: Any, out_tree: Any, numbers: Sequence[int]) -> ja
 
 
 def _compile_and_keep(
-    file: Path, traced: jax.stages.Lowered, options: Mapping[str, str | bool] | None
+    file: Path, traced: jax.stages.Lowered, options: dict[str, str | bool] | None
 ) -> jax.stages.Compiled:
     hits = _hits_of_thread()
     compiled = traced.compile(options)
@@ -166,17 +168,17 @@ def _listen() -> None:
     jax.monitoring.register_event_listener(count)
 
 
-class KeptFunction(Generic[Given, Returned]):
+class KeptFunction(Generic[Returned]):
     """A function as `jax.jit` makes it; where a command keeps programs, it is loaded without being traced."""
 
-    def __init__(self, function: Callable[Given, Returned], static_argnums: tuple[int, ...]) -> None:
+    def __init__(self, function: Callable[..., Returned], static_argnums: tuple[int, ...]) -> None:
         functools.update_wrapper(self, function)
         self._static, self._signature = static_argnums, inspect.signature(function)
         self._function, self._traced = function, jax.jit(function, static_argnums=static_argnums)
         self._compiled: dict[Any, jax.stages.Compiled] = {}
         self._one_at_a_time = threading.Lock()
 
-    def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> Returned:
+    def __call__(self, *args: Any, **kwargs: Any) -> Returned:
         bound = self._signature.bind(*args, **kwargs)
         bound.apply_defaults()
         args = bound.args  # one program, however the arguments are given
@@ -184,7 +186,7 @@ class KeptFunction(Generic[Given, Returned]):
             return self._traced(*args)
         given = [arg for number, arg in enumerate(args) if number not in self._static]
         leaves, form = jax.tree.flatten(given)
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
             return self._traced(*args)
         static = tuple(arg for number, arg in enumerate(args) if number in self._static)
         told_apart = static, form, tuple(map(_kind_of, leaves))
@@ -194,7 +196,7 @@ class KeptFunction(Generic[Given, Returned]):
     def _compile(self, told_apart: Any, static: Any, given: Any, args: Any) -> jax.stages.Compiled:
         with self._one_at_a_time:
             if told_apart not in self._compiled:
-                place = place_of(self.__name__.strip("_"), (self.__module__, self._static, static), given)
+                place = place_of(self._function.__name__.strip("_"), (self.__module__, self._static, static), given)
                 function = jax.jit(place.named(self._function), static_argnums=self._static)
                 [self._compiled[told_apart]] = place.load_or_compile(
                     lambda: [function.lower(*args)], jax.local_devices()[:1]
@@ -202,7 +204,7 @@ class KeptFunction(Generic[Given, Returned]):
             return self._compiled[told_apart]
 
 
-def kept_jit(*static_argnums: int) -> Callable[[Callable[Given, Returned]], KeptFunction[Given, Returned]]:
+def kept_jit(*static_argnums: int) -> Callable[[Callable[..., Returned]], KeptFunction[Returned]]:
     """Returns a decorator like `jax.jit`, for what every command computes a few times, on the first device.
 
     Args:
@@ -220,8 +222,8 @@ def place_of(name: str, made_of: object, arguments: Any) -> Place:
         arguments: of the first, arrays or their shapes in a tree.
     """
     folder = enabled_folder()
-    if folder is None or jax.process_count() > 1 or _has_user_code():
-        return Place(None)
+    if folder is None or jax.default_backend() != "cpu" or jax.process_count() > 1 or _has_user_code():
+        return Place(None)  # what GPUs load has not been tried
     leaves, form = jax.tree.flatten(arguments)
     parts = [name, repr(made_of), str(form), *map(_shape_of, leaves)]
     if any(" at 0x" in part for part in parts):  # an object that nothing but its address tells apart

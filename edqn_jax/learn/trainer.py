@@ -122,7 +122,7 @@ class Trainer:
 
     def _shaped(self) -> TrainState:
         self._load()
-        if self._chunk is not None:
+        if isinstance(self._chunk, jax.stages.Compiled):
             shapes = self._chunk.args_info[0][1]
         else:
             key = jax.random.key(0)
