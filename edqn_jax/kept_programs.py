@@ -221,14 +221,14 @@ def place_of(name: str, made_of: object, arguments: Any) -> Place:
         made_of: what they are traced from beside their arguments; its `repr` tells it apart.
         arguments: of the first, arrays or their shapes in a tree.
     """
-    folder = enabled_folder()
-    if folder is None or jax.default_backend() != "cpu" or jax.process_count() > 1 or _has_user_code():
+    folder = folder_without_user_code()
+    if folder is None or jax.default_backend() != "cpu" or jax.process_count() > 1:
         return Place(None)  # what GPUs load has not been tried
     leaves, form = jax.tree.flatten(arguments)
     parts = [name, repr(made_of), str(form), *map(_shape_of, leaves)]
     if any(" at 0x" in part for part in parts):  # an object that nothing but its address tells apart
         return Place(None)
-    parts += [_digest_of_package(), str(PACKAGE), *_surroundings()]
+    parts += [digest_of_package(), str(PACKAGE), *_surroundings()]
     return Place(folder / f"{name}-{name_of(*(part.encode() for part in parts))}.program")
 
 
@@ -237,9 +237,10 @@ def without_seed(config: Config) -> Config:
     return dataclasses.replace(config, train=dataclasses.replace(config.train, seed=0))
 
 
-def _has_user_code() -> bool:
+def folder_without_user_code() -> Path | None:
+    """Returns the folder in which a command keeps what the package alone computes; None if nothing is kept."""
     own = (entries.own for entries in vars(registry).values() if isinstance(entries, Registry))
-    return bool(user_code.IMPORTED) or any(own)
+    return None if user_code.IMPORTED or any(own) else enabled_folder()
 
 
 def _kind_of(leaf: Any) -> Any:
@@ -272,6 +273,7 @@ def _versions() -> list[str]:
 
 
 @functools.cache
-def _digest_of_package() -> str:
+def digest_of_package() -> str:
+    """Returns what tells apart the sources of the package."""
     files = sorted(file for file in PACKAGE.rglob("*") if file.suffix in SOURCES)
     return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()

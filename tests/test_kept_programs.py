@@ -101,7 +101,7 @@ def test_programs_are_told_apart_by_what_they_are_made_of(folder: Path, monkeypa
     others.append(place())
     monkeypatch.undo()
     monkeypatch.setattr(cache, "_enabled", [folder])
-    monkeypatch.setattr(kept_programs, "_digest_of_package", lambda: "of an earlier version")
+    monkeypatch.setattr(kept_programs, "digest_of_package", lambda: "of an earlier version")
     others.append(place())
     monkeypatch.undo()
     monkeypatch.setattr(cache, "_enabled", [folder])

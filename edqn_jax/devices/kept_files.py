@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 _DIGEST = 32  # bytes
 
@@ -25,6 +31,24 @@ def write_kept(file: Path, content: bytes) -> None:
         made = Path(scratch) / file.name
         made.write_bytes(hashlib.sha256(content).digest() + content)
         made.replace(file)
+
+
+def kept_array(folder: Path | None, name: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+    """Returns an array that is kept in a folder by this name, else the one made now, and keeps it.
+
+    Args:
+        folder: None if nothing is kept.
+        name: tells apart what the array is made of, as of `name_of`.
+        make: returns it.
+    """
+    content = None if folder is None else read_kept(folder / f"{name}.npy")
+    if content is not None:
+        return np.load(io.BytesIO(content), allow_pickle=False)
+    values, packed = make(), io.BytesIO()
+    if folder is not None:
+        np.save(packed, values)
+        write_kept(folder / f"{name}.npy", packed.getvalue())
+    return values
 
 
 def name_of(*parts: bytes) -> str:

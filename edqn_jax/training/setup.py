@@ -30,7 +30,7 @@ from edqn_jax.learn.state import TrainState
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.learn.updates import check_begins
 from edqn_jax.planning.astar import Path as ShortestPath
-from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.astar import kept_shortest_path
 from edqn_jax.sim.task.env import check_sensor
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward, check_reward
@@ -164,8 +164,7 @@ class TrainingSetup:
         )
 
     def _shortest(self) -> ShortestPath:
-        scene = self.missions[0].scene
-        return shortest_path(scene, scene.start, scene.goal, self.config.drone.body_radius_m)
+        return kept_shortest_path(self.missions[0].scene, self.config.drone.body_radius_m)
 
     def _placed(self, tree: Tree) -> Tree:
         """Returns arrays as `fly_missions` takes them."""

@@ -5,14 +5,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+from edqn_jax.devices import cache
 from edqn_jax.errors import ConfigError
+from edqn_jax.planning import astar
 from edqn_jax.planning.astar import main, shortest_path
 from edqn_jax.planning.lattice import NoPathError
 from edqn_jax.sim.scene.distance import signed_distance
@@ -123,3 +127,21 @@ def test_it_runs_alone(capsys, tmp_path):
     assert "straight line          8.00 m" in capsys.readouterr().out
     assert main(["--world", "nowhere"]) == 2
     assert "there is no scene 'nowhere'" in capsys.readouterr().err
+
+
+def test_a_command_finds_the_path_that_an_earlier_one_has_found(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ends = {"start": np.ones(3), "goal": np.array([9.0, 9, 3])}
+    worlds = [dataclasses.replace(small_world(box((x, 3, 0), (x + 1, 7, 3))), **ends) for x in (4.0, 6.0)]
+    found = [astar.kept_shortest_path(world, RADIUS) for world in worlds]
+    assert found[0].length_m != found[1].length_m
+    monkeypatch.setattr(cache, "_enabled", [tmp_path])
+    kept = [astar.kept_shortest_path(world, RADIUS) for world in worlds]
+    assert len(list(tmp_path.glob("path-*"))) == 2
+    monkeypatch.setattr(astar, "shortest_path", None)
+    again = [astar.kept_shortest_path(world, RADIUS) for world in worlds]
+    for paths in zip(found, kept, again, strict=True):
+        for other in paths[1:]:
+            np.testing.assert_array_equal(paths[0].points, other.points)
+            assert (paths[0].length_m, paths[0].grid_length_m) == (other.length_m, other.grid_length_m)

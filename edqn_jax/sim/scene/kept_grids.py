@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.devices.cache import private_folder
-from edqn_jax.devices.kept_files import name_of, read_kept, write_kept
+from edqn_jax.devices.kept_files import kept_array, name_of
 
 KEPT_VALUES = 2**18
 """Of a grid that is kept; smaller ones are made in a second or two."""
@@ -29,18 +28,8 @@ def kept_values(made_of: Sequence[bytes], make: Callable[[], NDArray[np.floating
         made_of: all that the values depend on.
         make: returns them, [X, Y, Z] metres.
     """
-    folder = private_folder()
-    if folder is None:
-        return make().astype(np.float32)
     told_apart = (*made_of, *(source.read_bytes() for source in _MADE_BY), _compiled_by())
-    file = folder / f"grid-{name_of(*told_apart)}.npy"
-    content = read_kept(file)
-    if content is not None:
-        return np.load(io.BytesIO(content), allow_pickle=False)
-    values, packed = make().astype(np.float32), io.BytesIO()
-    np.save(packed, values)
-    write_kept(file, packed.getvalue())
-    return values
+    return kept_array(private_folder(), f"grid-{name_of(*told_apart)}", lambda: make().astype(np.float32))
 
 
 def _compiled_by() -> bytes:
