@@ -67,11 +67,11 @@ class Place:
             return None
         try:
             libraries, programs = pickle.loads(content)
-            if not all(build.ensure_registered(*_arguments(library)) for library in libraries):
-                return None
-            loaded = [_load(self.file.parent / name, *others) for name, *others in programs]
         except Exception:  # whatever is wrong with what another version has written, they are compiled
             return None
+        if not all(build.ensure_registered(*_arguments(library)) for library in libraries):
+            return None
+        loaded = [_load(self.file.parent / name, *others) for name, *others in programs]
         found = [each for each in loaded if each is not None]
         return found if len(found) == len(loaded) else None
 
@@ -135,8 +135,11 @@ def _load(file: Path, in_tree: Any, out_tree: Any, numbers: Sequence[int]) -> ja
     content, devices = read_kept(file), jax.devices()
     if content is None:
         return None
-    devices = [devices[number] for number in numbers]
-    return serialize_executable.deserialize_and_load(content, in_tree, out_tree, execution_devices=devices)
+    try:
+        on = [devices[number] for number in numbers]
+        return serialize_executable.deserialize_and_load(content, in_tree, out_tree, execution_devices=on)
+    except Exception:  # as in `Place.load`
+        return None
 
 
 def _compile_and_keep(
@@ -198,14 +201,14 @@ class KeptFunction(Generic[Returned]):
             if told_apart not in self._compiled:
                 place = place_of(self._function.__name__.strip("_"), (self.__module__, self._static, static), given)
                 function = jax.jit(place.named(self._function), static_argnums=self._static)
-                [self._compiled[told_apart]] = place.load_or_compile(
-                    lambda: [function.lower(*args)], jax.local_devices()[:1]
-                )
+                devices = {device for leaf in jax.tree.leaves(given) for device in getattr(leaf, "devices", set)()}
+                on = sorted(devices, key=lambda device: device.id) or jax.local_devices()[:1]
+                [self._compiled[told_apart]] = place.load_or_compile(lambda: [function.lower(*args)], on)
             return self._compiled[told_apart]
 
 
 def kept_jit(*static_argnums: int) -> Callable[[Callable[..., Returned]], KeptFunction[Returned]]:
-    """Returns a decorator like `jax.jit`, for what every command computes a few times, on the first device.
+    """Returns a decorator like `jax.jit`, for what every command computes a few times.
 
     Args:
         static_argnums: places of arguments that are static, told apart by their `repr`.

@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from edqn_jax import kept_programs, user_code
@@ -135,3 +136,23 @@ def test_a_program_that_calls_python_is_not_kept(folder: Path) -> None:
         [asking] = here.load() or here.compile([jax.jit(ask).lower(1.0)], jax.devices()[:1])
         assert asking(2.0) == 2.0
     assert not list(folder.glob("*.executable"))
+
+
+def test_a_function_is_loaded_whatever_it_is_given_by(folder: Path) -> None:
+    traced = []
+
+    def scaled(values: jax.Array, times: int = 2, shift: Any = 0.0) -> jax.Array:
+        traced.append(times)
+        return values * times + shift
+
+    def outcomes(function: Any) -> list[list[float]]:
+        values = jnp.arange(3.0)
+        results = [function(values), function(values, times=2), function(values, 3, shift=values)]
+        return [np.asarray(each).tolist() for each in (*results, jax.vmap(function)(values))]
+
+    expected = [[0, 2, 4], [0, 2, 4], [0, 4, 8], [0, 2, 4]]
+    assert outcomes(kept_programs.kept_jit(1)(scaled)) == expected and traced == [2, 3, 2]  # the last in `jax.vmap`
+    again = kept_programs.kept_jit(1)(scaled)
+    assert outcomes(again) == expected and traced == [2, 3, 2]
+    other = jax.device_put(jnp.arange(3.0), jax.devices()[-1])
+    assert again(other).devices() == other.devices() and again(np.arange(3.0, dtype=np.float32)).tolist() == [0, 2, 4]
