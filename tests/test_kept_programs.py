@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -144,6 +145,8 @@ def test_a_function_is_loaded_whatever_it_is_given_by(folder: Path) -> None:
     def scaled(values: jax.Array, times: int = 2, shift: Any = 0.0) -> jax.Array:
         traced.append(times)
         return values * times + shift
+
+    scaled.__name__ = f"scaled_{time.time_ns()}"  # or JAX has it from an earlier session, and it is not kept
 
     def outcomes(function: Any) -> list[list[float]]:
         values = jnp.arange(3.0)
