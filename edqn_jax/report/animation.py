@@ -16,6 +16,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from PIL import Image
@@ -52,6 +53,8 @@ VIVID_COLOURS = 48
 """Those of them that are kept for vivid colours."""
 VIVID = 60
 """Difference of the channels, of 255, from which on a colour is vivid."""
+EXACT_COLOURS = (*OUTCOME_COLOURS.values(), LINE)
+"""Colours that a palette has as they are if a frame has them: what they mean is lost in the nearest other."""
 DISTANCE_COLOURS = "inferno_r"
 """Bright is near, black far away."""
 DOTS_PER_INCH = 100
@@ -398,12 +401,19 @@ def _mp4(frames: list[Image.Image], fps: float) -> bytes:
 def _palette(frames: list[Image.Image], number: int) -> Image.Image:
     """Returns an image with the palette of all frames.
 
-    Vivid colours have a share of their own: they are few pixels, but marks, events and paths are made of them.
+    Vivid colours have a share of their own: they are few pixels, but marks, events and paths are made of them. Those of
+    `EXACT_COLOURS` are of it.
     """
     chosen = np.unique(np.linspace(0, len(frames) - 1, 8).round().astype(int))
     pixels = np.concatenate([np.asarray(frames[i]).reshape(-1, 3) for i in chosen])
+    marks = (255 * to_rgba_array(EXACT_COLOURS)[:, :3]).round().astype(np.uint8)
+    exact = marks[[bool((pixels == mark).all(axis=1).any()) for mark in marks]]
     vivid = np.ptp(pixels.astype(int), axis=1) > VIVID
-    colours = [_main_colours(pixels[vivid], VIVID_COLOURS), _main_colours(pixels[~vivid], number - VIVID_COLOURS)]
+    colours = [
+        exact,
+        _main_colours(pixels[vivid], VIVID_COLOURS - len(exact)),
+        _main_colours(pixels[~vivid], number - VIVID_COLOURS),
+    ]
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.concatenate(colours).astype(np.uint8).tobytes())
     return palette

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import flight_files
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
-from edqn_jax.report.animation import LAST_FRAME_S, MAX_FRAMES, SIZE, Film, _rows_shown
+from edqn_jax.report.animation import LAST_FRAME_S, MAX_FRAMES, SIZE, Film, _rows_shown, encode_gif
 from edqn_jax.report.sights import SensorImages
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.runs.checkpoints.params import save_params
@@ -73,6 +74,17 @@ def test_the_last_frame_says_how_the_flight_ended_in_its_colour():
     gif = recorded(Drawn(), 4, outcome="collision")
     colour = OUTCOME_COLOURS["collision"]
     assert pixels_like(gif, 4, colour) > pixels_like(gif, 3, colour) + 100
+
+
+def test_few_green_pixels_stay_green_beside_many_vivid_ones():
+    """As in a mesh, whose distances alone have more colours than a palette."""
+    pixels = np.random.default_rng(0).integers(0, 255, (240, 320, 3), np.uint8)
+    pixels[..., 1] = np.minimum(pixels[..., 1], pixels[..., 0])  # no green among them
+    green = [int(OUTCOME_COLOURS["goal"][i : i + 2], 16) for i in (1, 3, 5)]
+    pixels[100:104, 100:104] = green
+    with Image.open(io.BytesIO(encode_gif([Image.fromarray(pixels)], [0.1]))) as gif:
+        shown = np.asarray(gif.convert("RGB")).astype(int)[100:104, 100:104]
+    assert np.abs(shown - green).max() < 8
 
 
 @pytest.mark.slow
