@@ -339,7 +339,12 @@ static XLA_FFI_Error* each_frame(XLA_FFI_CallFrame* call, Render* render, int we
     for (int i = ORIGIN; i < OPERANDS; ++i) of[i] = of_frame(&batch, i, m);
     frame_of(&batch, of, &camera, &shapes, &eye);
     fields_of_frame(&fields, m, &work.fields, &shapes);
-    render(&camera, &shapes, &eye, &work, batch.pictures + (int64_t)m * batch.height * batch.width);
+    const int64_t pixels = (int64_t)batch.height * batch.width;
+    float* picture = batch.pictures + m * pixels;
+    if (eye.is_finite || !weighted)
+      render(&camera, &shapes, &eye, &work, picture);
+    else
+      for (int64_t i = 0; i < pixels; ++i) picture[i] = not_a_number();
   }
   release(&work);
   return 0;

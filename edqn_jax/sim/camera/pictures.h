@@ -34,6 +34,13 @@ FN int is_finite(float x) {
   return (bits & 0x7f800000u) != 0x7f800000u;
 }
 
+FN float not_a_number(void) {
+  const uint32_t bits = 0x7fc00000u;
+  float x;
+  memcpy(&x, &bits, sizeof x);
+  return x;
+}
+
 /* Rounds to the nearest whole number, halves to even, for |x| < 2^22. */
 FN Lanes nearest_whole(Lanes x) { return (x + 12582912.0f) - 12582912.0f; }
 
@@ -63,6 +70,7 @@ typedef struct {
   const float *origin, *weights; /* [3] each */
   float cos, sin, sky;
   float forward[3], right[3], up[3]; /* of the image, in the world */
+  int is_finite;                     /* otherwise every pixel of a picture is NaN, as in JAX */
 } Eye;
 
 /* The ray of a column at `u` at height 0 of the image; one at height `v` has v x e->up more. */
@@ -677,6 +685,9 @@ FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, E
     e->forward[i] = c->tilted ? r[3 * i] : forward[i], e->right[i] = c->tilted ? -r[3 * i + 1] : right[i];
     e->up[i] = c->tilted ? r[3 * i + 2] : up[i];
   }
+  e->is_finite = 1;
+  UNROLLED for (int i = 0; i < 3; ++i)
+    e->is_finite &= is_finite(e->origin[i]) & is_finite(e->forward[i]) & is_finite(e->right[i]) & is_finite(e->up[i]);
 }
 
 /* Number of operands of pictures, or of depth images, which end before LIGHT. */

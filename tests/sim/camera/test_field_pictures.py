@@ -94,6 +94,20 @@ def test_c_draws_other_sizes_and_numbers_of_rays_and_patterns(world: Scene, moun
     agree(config, looking(world, 3), 1)
 
 
+@pytest.mark.parametrize("mount", ["level", "body"])
+@pytest.mark.parametrize("in_c", [True, False], ids=["c", "jax"])
+def test_a_pose_that_is_not_finite_gives_a_picture_of_nan(
+    world: Scene, mount: Any, in_c: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, turn = poses(world, 4)
+    place = place.at[jnp.arange(3), jnp.arange(3)].set(jnp.array([jnp.nan, jnp.inf, jnp.nan]))
+    turn = turn.at[3, 0, 0].set(jnp.nan).at[4, 1, 0].set(jnp.inf)
+    if not in_c:
+        monkeypatch.setattr(native, "can_render", lambda scene, platform: False)
+    picture, _ = images(CameraConfig(mount=mount), in_c, world, place, turn)
+    assert np.isnan(picture[:5]).all() and np.isfinite(picture[5:]).all()
+
+
 def test_worlds_whose_fields_stand_elsewhere_are_drawn_each_as_its_own(world: Scene) -> None:
     if not native.is_available("cpu"):
         return

@@ -296,3 +296,4 @@ def test_poses_that_are_not_finite_spoil_their_own_frame_alone(
     good = np.asarray(draw(scene, origin, rotation))
     bad = np.asarray(draw(scene, origin.at[1].set(jnp.nan).at[4].set(jnp.inf), rotation.at[2].set(jnp.nan)))
     np.testing.assert_array_equal(bad[[0, 3, 5]], good[[0, 3, 5]])
+    assert render is camera.render_depth or np.isnan(bad[[1, 2, 4]]).all()
