@@ -178,7 +178,8 @@ def _add_cost(table: Table, cost: Cost) -> None:
         kinds = cost.drawn_by_jax_on_gpus
         by += f", on GPUs JAX, because of its {_words(*kinds)}" if kinds else ", on GPUs CUDA"
     _add_row(table, "pictures are drawn by", f"{by}; about {_rounded(cost.picture_us)} µs each on two CPU cores")
-    _add_row(table, "training", f"some {_rounded(cost.decisions_per_s)} decisions/s on two CPU cores")
+    rate = f"some {_rounded(cost.decisions_per_s)} decisions/s on two CPU cores while the encoder learns, then more"
+    _add_row(table, "training", rate)
     _add_row(
         table,
         "memory",

@@ -37,6 +37,8 @@ def parse_export(argv: Sequence[str]) -> ExportArgs:
     args = parse_arguments(ExportArgs, argv, EXPORT)
     if args.checks < 1000:
         raise ConfigError(f"--checks must be at least 1000, not {args.checks}")
+    if args.out.suffix.lower() != ".onnx":
+        raise ConfigError(f"--out '{args.out}' must end in .onnx")
     check_is_saved(args.run, EXPORT)
     check_run(args.run)
     return args

@@ -103,8 +103,9 @@ class FlyArgs:
     """What follows a hover of 3 s after a fault, and a flight that takes too long."""
     at_goal: Ending = "hold"
     """What follows the goal."""
-    on: Annotated[tuple[str, ...], arg(metavar="FAULT=ACTION")] = ()
-    """What is done about a fault, hover, hold or land, as in "low battery=hold"; docs/deployment.md has their names."""
+    on: Annotated[tuple[str, ...], arg(metavar="FAULT=ACTION", help_behavior_hint="")] = ()
+    """What is done about a fault, hover, hold or land, as in "low battery=hold"; docs/deployment.md has their names,
+    and what is done otherwise."""
     max_s: Annotated[float, arg(metavar="S")] = 300.0
     """Longest flight, seconds."""
     least_rate: Annotated[float, arg(metavar="HZ")] = 0.1

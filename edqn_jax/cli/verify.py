@@ -16,9 +16,9 @@ from tyro.conf import Positional, arg
 from edqn_jax.cli.arguments import check_is_saved, parse_arguments
 from edqn_jax.cli.help import VERIFY
 from edqn_jax.cli.process.status import say_phase, show_phase
-from edqn_jax.errors import CheckError
+from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.files import check_can_write, write_atomically
-from edqn_jax.policies import no_run
+from edqn_jax.policies import SHIPPED, no_run
 
 if TYPE_CHECKING:
     from edqn_jax.runs.verification.verify import Finding
@@ -44,6 +44,8 @@ def parse_verify(argv: Sequence[str]) -> VerifyArgs:
     args = parse_arguments(VerifyArgs, argv, VERIFY)
     check_is_saved(args.run, VERIFY)
     if not (args.run / "config.yaml").is_file():
+        if str(args.run) in SHIPPED:
+            raise ConfigError(f"'{args.run}' comes with the package, without the run; give the folder of a run")
         raise no_run(args.run)
     return args
 

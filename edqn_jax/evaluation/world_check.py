@@ -43,6 +43,10 @@ _SHAPE_US = {"c": 0.1, "jax": 20.0, "fields": 120.0, "fields_by_jax": 320.0}
 _REST_US = 21.0
 """Of a decision of training on two cores but for its two pictures: some 34,000 a second (docs/performance.md)."""
 
+_FIELDS_AGAIN = 1.25
+"""How many pictures of its fields a decision costs beside those of the camera while the encoder learns: the label, and
+what else a training pays there. The ground floor makes 1,191 decisions/s on one core (docs/howto/own_world.md)."""
+
 _SHAPE_BYTES = {"jax": 4.4, "fields_by_jax": 9.6}
 """Bytes of a pixel that JAX holds for each shape while it draws a batch, as measured."""
 
@@ -61,7 +65,7 @@ class Cost:
     picture_us: float
     """Microseconds of a picture on two CPU cores."""
     decisions_per_s: float
-    """Of training on two CPU cores."""
+    """Of training on two CPU cores while the encoder learns, the slower part."""
     world_bytes: int
     training_bytes: int
     """Of the world and its pictures in a training of `num_envs` environments."""
@@ -256,18 +260,20 @@ def estimate_cost(config: Config, scene: Scene) -> Cost:
         rows |= {kind: "c" for kind in counts if kind not in by_jax}
     if FIELDS in counts:
         rows[FIELDS] = "fields_by_jax" if by_jax else "fields"
-    each = sum(_SHAPE_US[rows[kind]] * count for kind, count in counts.items())
+    of_kind = {kind: _SHAPE_US[rows[kind]] * count for kind, count in counts.items()}
     held = sum(_SHAPE_BYTES.get(rows[kind], 0.0) * count for kind, count in counts.items())
     world = bytes_of(scene)
     grids = sum(grid.values.nbytes for shapes in scene.shapes().values() for grid in getattr(shapes, "grids", ()))
     envs = Config().train.num_envs
     pictures = len(config.events.frame_times_s) * pixels * held
-    picture_us = (_PICTURE_US["jax" if by_jax else "c"] + each) * pixels / (32 * 24)
+    size = pixels / (32 * 24)
+    picture_us = (_PICTURE_US["jax" if by_jax else "c"] + sum(of_kind.values())) * size
+    label_us = _FIELDS_AGAIN * of_kind.get(FIELDS, 0.0) * size
     return Cost(
         drawn_by_jax=by_jax,
         drawn_by_jax_on_gpus=kinds_for_jax(scene, "cuda"),
         picture_us=picture_us,
-        decisions_per_s=1e6 / (len(config.events.frame_times_s) * picture_us + _REST_US),
+        decisions_per_s=1e6 / (len(config.events.frame_times_s) * picture_us + label_us + _REST_US),
         world_bytes=world + grids,
         training_bytes=int(_COPIES * grids + envs * (world + pictures)),
         num_envs=envs,

@@ -119,6 +119,7 @@ def test_a_mesh_becomes_a_field_that_c_draws_and_cuda_does_not(tmp_path: Path) -
     plain = check_world(ROOMS, str(corridor(tmp_path, WIDE))).cost
     assert plain is not None and plain.drawn_by_jax == [] and found.cost.picture_us > 10 * plain.picture_us
     assert 20_000 < plain.decisions_per_s < 35_000 and found.cost.decisions_per_s < plain.decisions_per_s / 2
+    assert 2_000 < found.cost.decisions_per_s < 2_800  # measured: 1,191 a core where one field fills all pictures
     grid = load_scene(file).others["fields"].grids[0]
     assert found.cost.world_bytes > grid.values.nbytes and found.cost.training_bytes > 2 * grid.values.nbytes
 

@@ -185,6 +185,6 @@ def test_export_writes_a_policy_and_its_runner(tmp_path, capsys):
 
 
 def test_export_refuses_what_it_cannot_do(tmp_path, capsys):
-    assert "must end in .onnx" in refused(capsys, "export", "pretrained", "--out", tmp_path / "policy.pt")
+    assert "--out 'policy.pt' must end in .onnx" in refused(capsys, "export", "pretrained", "--out", "policy.pt")
     assert "at least 1000" in refused(capsys, "export", "pretrained", "--out", "a.onnx", "--checks", 10)
     assert "there is no run in 'nowhere'" in refused(capsys, "export", "nowhere", "--out", "a.onnx")
