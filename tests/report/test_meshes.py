@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from matplotlib.figure import Figure
 from trimesh.creation import box, icosphere
 
 from edqn_jax.report.worlds.flights import OBLIQUE, draw_map, plot_stage
-from edqn_jax.report.worlds.meshes import EDGE, SECTION, Mesh, draw_meshes, mesh_of_shape
+from edqn_jax.report.worlds.meshes import EDGE, SECTION, Mesh, draw_meshes, floor_of, mesh_of_shape
 from edqn_jax.report.worlds.solids import make_cutaway, standing_rows
 from edqn_jax.report.worlds.views import MAP, View, pale, shaded
+from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import Scene
+from tests.support.meshes import mesh_world
 
 UP = np.array([0.0, 0.0, 1.0])
 GREY, RED = np.full(3, 0.5), np.array([0.8, 0.1, 0.1])
@@ -93,6 +96,31 @@ def test_a_map_of_a_hall_shows_its_walls_cut_and_its_floor_pale(roofed: Scene) -
     drawn = draw_meshes(MAP, [mesh], np.array([1.0, 0.0]), 0.05, np.array([360, 200]))
     wall, floor = drawn[100, 24], drawn[100, 180]  # x of 2.2 and 10 m
     assert is_like(wall, SECTION * shaded(mesh.colour, UP)) and is_like(floor, pale(shaded(mesh.colour, UP)))
+
+
+def test_a_map_shows_what_stands_on_a_floor_that_is_part_of_the_mesh(tmp_path: Path) -> None:
+    """As in a scan without a roof: walls and a table of the same mesh as the floor."""
+    floor = box(bounds=[[0, 0, 0], [12, 8, 0.2]])
+    parts = [
+        box(bounds=[[0, 0, 0], [0.4, 8, 3]]),
+        box(bounds=[[6, 0, 0], [6.4, 5, 3]]),
+        box(bounds=[[9, 2, 0], [11, 3, 1]]),
+    ]
+    mesh = trimesh.util.concatenate([floor, *parts])
+    assert isinstance(mesh, trimesh.Trimesh)
+    scene = load_scene(mesh_world(tmp_path, '<geom type="mesh" mesh="scan"/>', scan=(mesh.vertices, mesh.faces)))
+    above = make_cutaway(scene, MAP)
+    assert above.note == "a mesh's own floor is pale" and not make_cutaway(scene, OBLIQUE).note
+    (drawn,) = above.meshes
+    picture = draw_meshes(MAP, [drawn], np.zeros(2), 0.1, np.array([120, 80]))
+    grey = shaded(drawn.colour, UP)
+    for x, y, is_floor in ((3, 6, True), (8, 6, True), (0.2, 4, False), (6.2, 3, False), (10, 2.5, False)):
+        assert is_like(picture[int(10 * y), int(10 * x)], pale(grey) if is_floor else grey)
+
+
+@pytest.mark.parametrize("mesh", [box(bounds=[[0, 0, 0], [4, 4, 0.5]]), icosphere(3, 1.5)], ids=["a slab", "a ball"])
+def test_a_mesh_without_a_floor_of_its_own_is_drawn_as_it_is(mesh: trimesh.Trimesh) -> None:
+    assert floor_of(Mesh(np.asarray(mesh.triangles), GREY), -1.0, 1.0) is None
 
 
 def test_a_view_from_beside_goes_through_the_near_wall_alone(roofed: Scene) -> None:

@@ -27,6 +27,13 @@ EDGE = 0.6
 EDGE_M = 0.15
 """Metres along the view between a pixel and one beside it from which on there is an edge."""
 
+FLOOR_M = 0.3
+"""Metres above a mesh's own floor up to which it is part of the floor."""
+FLOOR_SHARE = 0.25
+"""Share of the ground below a mesh that its floor covers, at least."""
+
+_LEVEL = 0.9  # of a normal's upward part
+_RISES_M = 1.0  # by which a mesh is higher than its floor, at least
 _EDGE_PIXELS = 6.0  # the same in pixels: a slope is no edge
 _AT_ONCE = 2**20  # pixels in the boxes around triangles that are drawn together
 _ASIDE = np.array([0.3127, 0.6713])  # pixels: sides along the axes are not to run through middles of pixels
@@ -62,6 +69,34 @@ def mesh_of_shape(kind: ShapeKind, shape: Any) -> Mesh | None:
         return None
     corners = shape.position + np.asarray(asset["vertex"])[faces] @ np.asarray(shape.rotation).T
     return Mesh(corners, np.asarray(shape.albedo), kind.custom is None or THICKNESS not in kind.custom(shape))
+
+
+def floor_of(mesh: Mesh, lowest: float, highest: float) -> float | None:
+    """Returns the height, metres, of the floor that is part of a mesh, as of a scan; None if it has none.
+
+    It is where most of the level area is, if that covers enough and the mesh rises above it.
+
+    Args:
+        mesh: in the world.
+        lowest: height, metres, above which a floor may be.
+        highest: the same below which it may be.
+    """
+    a, b, c = np.moveaxis(mesh.corners, 1, 0)
+    normals, heights = np.cross(b - a, c - a) / 2, mesh.corners[..., 2].mean(1)
+    area = np.linalg.norm(normals, axis=1)
+    upwards = normals[:, 2] if mesh.is_closed else np.abs(normals[:, 2])
+    level = (upwards > _LEVEL * area) & (heights >= lowest) & (heights <= highest)
+    if not level.any():
+        return None
+    order = np.argsort(heights[level])
+    heights, area = heights[level][order], area[level][order]
+    until = np.concatenate([[0.0], np.cumsum(area)])
+    covered = until[np.searchsorted(heights, heights + FLOOR_M, side="right")] - until[:-1]
+    first = int(np.argmax(covered))
+    corners = mesh.corners.reshape(-1, 3)
+    floor = float(heights[np.searchsorted(until[1:], until[first] + covered[first] / 2)])
+    wide_enough = covered[first] >= FLOOR_SHARE * np.prod(np.ptp(corners[:, :2], axis=0))
+    return floor if wide_enough and corners[:, 2].max() >= floor + _RISES_M else None
 
 
 def plot_meshes(axes: Axes, view: View, meshes: Sequence[Mesh]) -> None:

@@ -16,7 +16,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.patches import Polygon
 
 from edqn_jax.config import SHAPES
-from edqn_jax.report.worlds.meshes import Mesh, mesh_of_shape, plot_meshes
+from edqn_jax.report.worlds.meshes import FLOOR_M, Mesh, floor_of, mesh_of_shape, plot_meshes
 from edqn_jax.report.worlds.views import SUN, View, pale, shaded
 from edqn_jax.sim.scene.scene import PARKED, Scene, scene_at
 from edqn_jax.sim.scene.shapes.kind import ShapeKind
@@ -139,6 +139,8 @@ class CutawayView:
     """Meshes that are drawn as they are."""
     within: list[Solid] = dataclasses.field(default_factory=list)
     """Convex solids that fill those meshes, as far as they are shown."""
+    has_pale_floor: bool = False
+    """On a map: whether a floor that is part of a mesh is pale, so that what stands on it is seen."""
 
     @property
     def hiding(self) -> list[Solid]:
@@ -152,6 +154,7 @@ class CutawayView:
         parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", walls)) if cut]
         notes = [f"{' and '.join(parts)} cut away"] if parts else []
         notes += ["open is pale"] if self.passable else []
+        notes += ["a mesh's own floor is pale"] if self.has_pale_floor else []
         if self.cut is not None:
             low, high = self.cut
             notes.append(f"cut at {high:.1f} m" + (f", pale below {low:.1f} m" if np.isfinite(low) else ""))
@@ -173,7 +176,7 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
     planes = zip(np.asarray(scene.planes.position), np.asarray(scene.planes.normal), strict=True)
     has_ceiling = any(normal[2] < -0.9 and middle < position[2] < PARKED / 10 for position, normal in planes)
     shown, near_walls, solids, cut = [], [], [], None
-    meshes, within = [], []
+    meshes, within, has_pale_floor = [], [], False
     for kind, shape in standing_rows(static_scene(scene)):
         parts, mesh = solids_of_shape(kind, shape), mesh_of_shape(kind, shape)
         heights = cut_of(parts, scene)
@@ -188,6 +191,9 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
         open_below = -np.inf if heights is None or view.elevation < 89 else heights[0]
         if view.elevation >= 89 and all(_is_passable(part, lower[2], upper[2], has_ceiling) for part in parts):
             open_below = np.inf
+        floor = floor_of(mesh, lower[2] - ABOVE_M, lower[2] + ABOVE_M) if view.elevation >= 89 else None
+        if floor is not None and floor + FLOOR_M > open_below:
+            open_below, has_pale_floor = floor + FLOOR_M, True
         meshes.append(dataclasses.replace(mesh, cuts=cuts, open_below=open_below))
     for solid in solids:
         side = boundary_side(solid, lower, upper)
@@ -202,7 +208,7 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
         passable = [solid for solid in shown if _is_passable(solid, lower[2], upper[2], has_ceiling)]
     shown = [solid for solid in shown if not any(solid is each for each in passable)]
     moving = moving_solids(scene, 0.0)
-    return CutawayView(shown, near_walls, has_ceiling, moving, cut, passable, meshes, within)
+    return CutawayView(shown, near_walls, has_ceiling, moving, cut, passable, meshes, within, has_pale_floor)
 
 
 def _cuts(corners: np.ndarray, view: View, height: float) -> tuple[tuple[np.ndarray, float], ...]:
