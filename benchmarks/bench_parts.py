@@ -54,3 +54,7 @@ def test_part(name: str, now: Moment, benchmark: BenchmarkFixture) -> None:
     part = Timed(PARTS[name](now), mesh, train.num_envs)
     benchmark.extra_info["decisions"] = STEPS * train.num_envs
     assert benchmark(part.seconds, STEPS) > 0
+
+
+if __name__ == "__main__":
+    print(__doc__)  # pytest runs it
