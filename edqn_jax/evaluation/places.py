@@ -38,7 +38,8 @@ def check_seed(seed: int, missions: int = 1) -> None:
     """Raises ConfigError if there are no missions of this seed."""
     if seed < 0 or (seed + 1) * missions >= 2**31:
         last = 2**31 // missions - 2
-        raise ConfigError(f"--seed must be from 0 to {last} for {missions} missions, not {seed}")
+        several = f" for {missions} missions" if missions > 1 else ""
+        raise ConfigError(f"--seed must be from 0 to {last}{several}, not {seed}")
 
 
 def moved_ends(start: Point | None, goal: Point | None) -> dict[str, jax.Array]:

@@ -300,6 +300,7 @@ def test_the_commands_fly_a_function(file: Path, tmp_path: Path, capsys: pytest.
     ("words", "says"),
     [
         (["verify", "pretrained"], "'pretrained' comes with the package, without the run; give the folder of a run"),
+        (["check", "rooms", "--seed", "-1"], "--seed must be from 0 to 2147483646, not -1"),
         (["verify", "mine.py:f"], "'edqn verify' needs a saved policy, with its parameters, and 'mine.py:f' is a"),
         (["export", "mine:f", "--out", "a.onnx"], "'edqn export' needs a saved policy"),
         (["evaluate", "nowhere.py:f"], "there is no file 'nowhere.py'"),
