@@ -297,19 +297,3 @@ def test_poses_that_are_not_finite_spoil_their_own_frame_alone(
     bad = np.asarray(draw(scene, origin.at[1].set(jnp.nan).at[4].set(jnp.inf), rotation.at[2].set(jnp.nan)))
     np.testing.assert_array_equal(bad[[0, 3, 5]], good[[0, 3, 5]])
     assert render is camera.render_depth or np.isnan(bad[[1, 2, 4]]).all()
-
-
-@pytest.mark.parametrize("mount", ["level", "body"])
-def test_the_kernels_of_gpus_draw_nothing_from_a_pose_that_is_not_finite(
-    kernels: bool, monkeypatch: pytest.MonkeyPatch, mount: Literal["level", "body"]
-) -> None:
-    if not kernels:
-        return
-    scene, origin, rotation = frames([crowd(np.random.default_rng(1))], 4, seed=2)
-    call = native._call
-    monkeypatch.setattr(native, "_call", lambda target, *given: call(f"emulated_{target}", *given))
-    config, weights = dataclasses.replace(CONFIG, mount=mount), jnp.broadcast_to(jnp.asarray(LUMA_WEIGHTS), (4, 3))
-    picture, _ = in_c(
-        native._call, config, scene, origin.at[1, 2].set(jnp.nan), rotation.at[2, 1, 0].set(jnp.inf), weights
-    )
-    assert np.isnan(picture[1:3]).all() and np.isfinite(picture[::3]).all()
