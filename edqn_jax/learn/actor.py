@@ -71,6 +71,25 @@ def observation_size(config: Config) -> int:
     return embedding.embedding_size(config) + (MOVE_SIZE if config.agent.last_move else 0) + own_size(config)
 
 
+def grow_moves(config: Config, known: Config, q: Params) -> Params:
+    """Returns a Q-network's parameters for observations with the last move, whose weights begin at 0.
+
+    Args:
+        config: of the new observations.
+        known: with which the parameters were trained; they are returned as they are where both see the move, or
+            neither does.
+        q: of the network `mlp`; those of others are returned as they are.
+    """
+    if config.agent.last_move <= known.agent.last_move or known.agent.network != "mlp":
+        return q
+    kernel = q["Dense_0"]["kernel"]
+    rows = kernel.reshape(known.agent.history, observation_size(known), -1)
+    blank = jnp.zeros((len(rows), MOVE_SIZE, rows.shape[-1]))
+    seen = embedding.embedding_size(known)
+    grown = jnp.concatenate([rows[:, :seen], blank, rows[:, seen:]], axis=1)
+    return {**q, "Dense_0": {**q["Dense_0"], "kernel": grown.reshape(-1, rows.shape[-1])}}
+
+
 @dataclasses.dataclass(frozen=True)
 class AgentActor(Actor):
     """The package's own agent, greedy: an encoder, a memory that stacks observations, and a learner's network."""

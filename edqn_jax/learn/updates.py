@@ -19,7 +19,7 @@ from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.keys import split_each
 from edqn_jax.learn import samples
-from edqn_jax.learn.actor import PolicyParams
+from edqn_jax.learn.actor import PolicyParams, grow_moves
 from edqn_jax.learn.learner import VAE_METRICS, Metrics, State, UpdateStats, learner_of
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Policy
@@ -59,8 +59,8 @@ def init_networks(config: Config, key: Array) -> Networks:
 def begin_networks(config: Config, fresh: Networks, known: Config, policy: PolicyParams) -> Networks:
     """Returns networks that begin with those of a policy; their optimisers have seen nothing.
 
-    Where the own motion has values that the policy did not know, as with a camera on the body, their weights begin at
-    0.
+    Where the own motion has values that the policy did not know, as with a camera on the body, or the Q-network sees
+    the last move and did not, their weights begin at 0.
 
     Args:
         config: of the run.
@@ -74,10 +74,8 @@ def begin_networks(config: Config, fresh: Networks, known: Config, policy: Polic
     learner = learner_of(config)
     if learner.begin_from is None:
         raise ConfigError(f"the learner '{config.agent.learner}' cannot begin with a policy: it has no `begin_from`")
-    vae = embedding.grow_motion(config, known, policy.encoder)
-    wanted, found = (
-        jax.tree.map(jnp.shape, each) for each in ((fresh.vae, learner.policy(fresh.agent)), (vae, policy.q))
-    )
+    vae, q = embedding.grow_motion(config, known, policy.encoder), grow_moves(config, known, policy.q)
+    wanted, found = (jax.tree.map(jnp.shape, each) for each in ((fresh.vae, learner.policy(fresh.agent)), (vae, q)))
     if wanted != found:
         raise ConfigError(
             "the networks of this run have other shapes than those of the policy that it is to begin with; give the "
@@ -87,7 +85,7 @@ def begin_networks(config: Config, fresh: Networks, known: Config, policy: Polic
         fresh,
         vae=vae,
         encoder=embedding.inference_params(config, vae),
-        agent=learner.begin_from(config, fresh.agent, policy.q),
+        agent=learner.begin_from(config, fresh.agent, q),
     )
 
 

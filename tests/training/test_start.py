@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -14,10 +15,13 @@ import edqn_jax
 from edqn_jax.cli.train import parse_train
 from edqn_jax.config import Config
 from edqn_jax.config.registry import LEARNERS
+from edqn_jax.learn.actor import AgentActor, PolicyParams, blank_observation
 from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import Policy, fresh_policy
+from edqn_jax.learn.qnetwork import network_values
 from edqn_jax.learn.updates import Networks, begin_networks, init_networks
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from edqn_jax.training.setup import set_up_training
 
 SMALL = edqn_jax.make_config("medium", camera={"width": 16, "height": 8}, agent={"hidden": (8,)})
@@ -58,6 +62,28 @@ def test_what_a_camera_on_the_body_adds_to_the_own_motion_changes_no_code_at_fir
         # The contrast is the last value, and roll and pitch of two frames are before it.
         more = np.concatenate([values[:-1], lean, values[-1:]])
         np.testing.assert_allclose(more @ new, values @ old, rtol=1e-5, atol=1e-5)
+
+
+def test_a_last_move_that_the_policy_did_not_see_changes_no_value_at_first() -> None:
+    told = dataclasses.replace(SMALL, agent=dataclasses.replace(SMALL.agent, last_move=True))
+    agent = begin(told).agent
+    rng, known, more = np.random.default_rng(0), AgentActor(SMALL), AgentActor(told)
+    observations = [
+        dataclasses.replace(
+            blank_observation(SMALL),
+            own=jnp.asarray(rng.normal(size=OWN_SIZE), jnp.float32),
+            motion=jnp.asarray(rng.normal(size=MOTION_SIZE), jnp.float32),
+        )
+        for _ in range(SMALL.agent.history)
+    ]
+    values = []
+    for actor, q in ((known, POLICY.params.q), (more, learner_of(told).policy(agent))):
+        params, memory = PolicyParams(POLICY.params.encoder, q), actor.init()
+        for observation in observations:
+            memory = actor.encode(params, memory, observation)
+        values.append(network_values(actor.config.agent, q, memory))
+    np.testing.assert_allclose(values[1], values[0], rtol=1e-5, atol=1e-5)
+    assert_equal_trees(begin(told, Policy(told, PolicyParams(POLICY.params.encoder, agent.q))).agent.q, agent.q)
 
 
 def test_networks_of_other_shapes_and_learners_that_cannot_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
