@@ -267,7 +267,7 @@ def _sees(config: Config) -> str:
         said += f" (threshold {events.threshold:g})"
     if config.encoder.levelled:
         said += ", moved to where a level camera would have them"
-    own = ", its own state and motion"
+    own = ", its own state, motion and last move" if config.agent.last_move else ", its own state and motion"
     if config.camera.mount == "body":
         own += ", roll and pitch at each frame"
     return said + own + (", the contrast of its sensor" if events.most_contrast else "")

@@ -6,6 +6,8 @@ r"""Makes a policy that comes with the package: trains five seeds, measures the 
         --out runs/looks-further
     python scripts/pretrain.py --kind autopilot --world narrow --start-from runs/looks-further --run runs/autopilot \
         --seeds 1 --measured runs/looks.md --out edqn_jax/policies/pretrained-looks
+    python scripts/pretrain.py --kind late --world narrow --start-from edqn_jax/policies/pretrained-looks \
+        --run runs/late --seeds 1 --out runs/late-looks
     python scripts/pretrain.py --kind body --world narrow --start-from edqn_jax/policies/pretrained-looks \
         --run runs/body --seeds 1 --out edqn_jax/policies/pretrained-body
 
@@ -71,6 +73,9 @@ AGAIN = (
 AUTOPILOT = ("--env.setpoint-m-s2", "4", "--env.setpoint-share", "0.75")
 """Three quarters of the episodes have an autopilot that changes the velocity it holds slowly."""
 
+LATE = ("--env.action-delay", "1", "--env.delay-share", "0.5", "--agent.last-move")
+"""In half of the episodes moves are flown a decision late; the Q-network knows the move that is about to be flown."""
+
 BODY = ("--camera.mount", "body", "--encoder.levelled")
 
 VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0, "narrow": 0}
@@ -84,11 +89,15 @@ KINDS: dict[str, tuple[int, tuple[str, ...]]] = {
     "looks": (220_000_000, LOOKS),
     "further": (185_000_000, (*LOOKS, *AGAIN, "--encoder.retrain-at", "0.05", "0.35")),
     "autopilot": (370_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, "--encoder.retrain-at", "0.05", "0.35")),
+    "late": (370_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, *LATE, "--encoder.retrain-at", "0.05", "0.35")),
     "body": (150_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, *BODY, "--encoder.retrain-at", "0.06", "0.3")),
 }
 """Decisions of each seed, 0 as `DECISIONS`, and further options, by the kind of policy: of one plaid, of any look, the
-latter trained further, for a slow autopilot, and for one with a camera on the body; these three begin with one of any
-look."""
+latter trained further, for a slow autopilot, also for moves that are late, and with a camera on the body; these four
+begin with one of any look."""
+
+BEGIN = ("further", "autopilot", "late", "body")
+"""Kinds that begin with a policy of any look."""
 
 MISSIONS = 1000
 """Test worlds of each family; training never uses them."""
@@ -132,7 +141,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="folder of policy and card; replaced")
     parser.add_argument("--world", choices=sorted(DECISIONS), default="mixed", help="to train on (default mixed)")
     parser.add_argument("--kind", choices=sorted(KINDS), default="plaid", help="of policy (default plaid)")
-    parser.add_argument("--start-from", type=Path, help="policy that `further`, `autopilot` and `body` begin with")
+    parser.add_argument("--start-from", type=Path, help=f"policy that {_listed(BEGIN)} begin with")
     parser.add_argument("--seeds", type=int, default=SEEDS, help=f"agents that are trained (default {SEEDS})")
     parser.add_argument("--first-seed", type=int, default=0, help="of the first agent (default 0)")
     parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a family (default {MISSIONS})")
@@ -145,8 +154,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     for name in ("missions", "seeds"):
         if getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
-    if (args.kind in ("further", "autopilot", "body")) != (args.start_from is not None):
-        parser.error("--start-from is for the kinds further, autopilot and body, and needed there")
+    if (args.kind in BEGIN) != (args.start_from is not None):
+        parser.error(f"--start-from is for the kinds {_listed(BEGIN)}, and needed there")
     if args.kind == "plaid" and (args.looks or args.measured):
         parser.error("--looks and --measured are for the kinds of any look")
     if args.run.is_dir() and args.commit is None:
@@ -154,6 +163,10 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     if args.test_seed is None:
         args.test_seed = 0 if args.kind == "plaid" else TEST_SEED
     return args
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def measure(args: argparse.Namespace, policy: Policy, run: Path, measured: dict[str, str]) -> str:

@@ -107,7 +107,7 @@ def cells(card: str, row: str) -> list[list[str]]:
     return [line.strip("| ").split(" | ")[1:] for line in card.splitlines() if line.startswith(f"| {row} |")]
 
 
-@pytest.mark.parametrize("kind", ["looks", "further", "autopilot", "body"])
+@pytest.mark.parametrize("kind", ["looks", "further", "autopilot", "late", "body"])
 def test_a_policy_of_any_look_has_a_row_for_each_look_and_a_column_for_each_family(
     kind: str, pretrain: ModuleType, tmp_path: Path, asked: list[tuple[Any, ...]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,7 +134,14 @@ def test_a_policy_of_any_look_has_a_row_for_each_look_and_a_column_for_each_fami
     assert ("from `runs/first`" in card) == (kind != "looks")
 
 
-@pytest.mark.parametrize(("kind", "sees"), [("looks", "own state and motion, the"), ("body", "at each frame, the")])
+@pytest.mark.parametrize(
+    ("kind", "sees"),
+    [
+        ("looks", "own state and motion, the"),
+        ("late", "own state, motion and last move, the"),
+        ("body", "at each frame, the"),
+    ],
+)
 def test_the_card_says_what_a_policy_was_trained_with(
     kind: str, sees: str, pretrain: ModuleType, tmp_path: Path, asked: list[tuple[Any, ...]]
 ) -> None:
@@ -150,12 +157,13 @@ def test_the_card_says_what_a_policy_was_trained_with(
     assert (
         "drag, mass off by up to 20%, thrust of each rotor off by up to 20%, motors that lag by up to 0.05 s" in errors
     )
-    assert ("changes by 4 m/s² or more in 75% of the episodes" in errors) == body
+    assert ("changes by 4 m/s² or more in 75% of the episodes" in errors) == (kind != "looks")
+    assert ("a delay of one decision in 50% of the episodes" in errors) == (kind == "late")
     assert cells(card, "closeness") == [["costs 0.25 within 0.6 m (`env.closeness_weight`)"]]
     assert ("A level camera" in card) != body
     assert cells(card, "seed") == [["0, the only one in 64 validation worlds (0: 90.0%)"]]
     assert "One training seed: how much another would differ is not known." in card
-    begin = " --start-from runs/first" if body else ""
+    begin = "" if kind == "looks" else " --start-from runs/first"
     assert f"`scripts/pretrain.py --kind {kind} --world narrow{begin} --seeds 1 --first-seed 0`" in card
     assert {look for _, look, *_ in asked} == {None, "wood"}
     for place in pretrain.model_card.PLACES:
@@ -250,6 +258,7 @@ def test_as_many_seeds_are_trained_as_are_asked_for(
         ["--measured", "a.md"],
         ["--kind", "looks", "--looks", "brick"],
         ["--kind", "body"],
+        ["--kind", "late"],
         ["--kind", "looks", "--start-from", "runs/first"],
     ],
 )

@@ -86,6 +86,18 @@ def test_its_script_trains_with_its_options(name: str, monkeypatch: pytest.Monke
         assert parse_train(script.options_of(world))[1].world.name == world
 
 
+def test_the_kind_late_is_that_of_the_autopilot_with_moves_that_are_late_in_half_of_the_episodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
+    script = import_module("pretrain")
+    begin = ["--start-from", LOOKS]
+    autopilot, late = (parse_train([*script.options_of("narrow", kind), *begin])[1] for kind in ("autopilot", "late"))
+    assert (late.env.action_delay, late.env.delay_share, late.agent.last_move) == (1, 0.5, True)
+    env = dataclasses.replace(autopilot.env, action_delay=1, delay_share=0.5)
+    assert late == dataclasses.replace(autopilot, env=env, agent=dataclasses.replace(autopilot.agent, last_move=True))
+
+
 def test_the_best_seed_is_that_of_the_validation_worlds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
     best_of = import_module("pretrain").best_of
