@@ -129,6 +129,17 @@ def young_process() -> Iterator[None]:
     gc.collect()
 
 
+@pytest.fixture(autouse=True, scope="session")
+def few_worlds_at_once() -> None:
+    """Draws random worlds in batches of eight, not of 64.
+
+    Tests have a handful of worlds, and a batch is filled up with copies, which are drawn as well.
+    """
+    from edqn_jax.sim.worlds import families
+
+    families._BATCH = 8
+
+
 @pytest.fixture
 def strict_jax() -> Iterator[None]:
     """No silent rank promotion, no key used twice, no leaked tracer; for our own functions, MJX breaks it."""

@@ -81,7 +81,7 @@ def test_a_run_derives_its_keys_from_its_streams_alone() -> None:
     """The environments of a run begin with the keys of the list above."""
     config = parse_train(MINIATURE)[1]
     world = run_missions(config).training.env_params
-    state = init_state(config, world, run_streams(5).learning)
+    state = jax.jit(lambda key: init_state(config, world, key))(run_streams(5).learning)
     initial = InitialKeys.split(run_streams(5).learning, config.train.num_envs, config.train.shards)
     begun = jax.vmap(lambda key: env.before_reset(config, world, key))(initial.environments)
     np.testing.assert_array_equal(

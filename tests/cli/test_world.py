@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from edqn_jax.cli import main
+from edqn_jax.devices import devices
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of
 from edqn_jax.sim.scene.scans import scan
 from edqn_jax.sim.scene.scans.point_files import read_points
@@ -32,7 +33,9 @@ def room() -> trimesh.Trimesh:
 
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing that a test makes lands in the repository; the devices are those of the tests."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
 
 
 def flown_inside(folder: str) -> None:
@@ -104,20 +107,29 @@ def pcd(points: np.ndarray, how: str, fields: str = "x y z", count: int | None =
     return head.encode() + table.tobytes()
 
 
-@pytest.mark.parametrize("kind", ["spaces.xyz", "commas.xyz", "ascii.pcd", "binary.pcd"])
-def test_points_are_those_of_the_file(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
-    points = trimesh.sample.sample_surface(room(), 40_000, seed=1)[0]
+def write_points(kind: str, points: np.ndarray) -> None:
     if kind.endswith("pcd"):
         Path(kind).write_bytes(pcd(points, kind.removesuffix(".pcd")))
     else:
         between = ", " if kind == "commas.xyz" else "  "
         rows = (between.join(f"{each:.5f}" for each in (*point, 0.5)) for point in points)
         Path(kind).write_text("# a comment\n\n" + "\n".join(rows) + "\n")
+
+
+@pytest.mark.parametrize("kind", ["spaces.xyz", "commas.xyz", "ascii.pcd", "binary.pcd"])
+def test_points_are_those_of_the_file(kind: str) -> None:
+    points = trimesh.sample.sample_surface(room(), 4000, seed=1)[0]
+    write_points(kind, points)
     np.testing.assert_allclose(read_points(Path(kind), kind[-3:], len(points)), points, atol=1e-5)
-    if kind in ("spaces.xyz", "binary.pcd"):
-        assert main(["world", kind, "--out", "here"]) == 0
-        assert "40,000 points, 0.1 m thick" in capsys.readouterr().out
-        flown_inside("here")
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("kind", ["spaces.xyz", "binary.pcd"])
+def test_files_of_points_are_worlds(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    write_points(kind, trimesh.sample.sample_surface(room(), 40_000, seed=1)[0])
+    assert main(["world", kind, "--out", "here"]) == 0
+    assert "40,000 points, 0.1 m thick" in capsys.readouterr().out
+    flown_inside("here")
 
 
 FEW = np.arange(15.0).reshape(5, 3)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ast
 import doctest
+import functools
 import importlib
 import re
 from collections.abc import Iterator
@@ -50,6 +51,7 @@ def public(body: list[ast.stmt], prefix: str) -> Iterator[tuple[str, Public]]:
                 yield from public(node.body, f"{prefix}.{node.name}")
 
 
+@functools.cache
 def everything() -> list[tuple[str, Public]]:
     found = []
     for file in sorted(PACKAGE.rglob("*.py")):

@@ -68,6 +68,7 @@ def test_a_policy_without_a_decoder_is_refused_in_a_sentence():
         check_predicts_distance(CONFIG, FunctionActor(lambda observation, memory, key: (0, memory)))
 
 
+@pytest.mark.whole
 def test_an_evaluation_compares_what_the_policy_acted_on_with_the_truth():
     params = jax.tree.map(jnp.copy, always((1, 0, 0)))
     # An untrained decoder draws about 0, which is infinitely far; this one draws half of the scale and its code.

@@ -15,6 +15,7 @@ from edqn_jax.config import AgentConfig, Config, EnvConfig, TrainConfig, get_pre
 from edqn_jax.learn import exploration, qnetwork, replay
 from edqn_jax.learn.dqn import losses
 from tests.support import probes
+from tests.support.marks import in_whole
 
 # --------------------------------------------------------------------------------- equations by hand
 
@@ -206,7 +207,7 @@ LEARNERS: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(
     scope="module",
-    params=["plain", *(pytest.param(n, marks=pytest.mark.slow) for n in ("refined", "n-step"))],
+    params=["plain", *in_whole("refined", "n-step")],
 )
 def learned(request):
     """Q [states, moves] of every probe by name, by the training step itself."""

@@ -146,6 +146,7 @@ def test_xlas_header_is_no_newer_than_that_of_the_installed_jaxlib() -> None:
     assert ours[0] == theirs[0] and int(ours[1].split()[-1]) <= int(theirs[1].split()[-1])
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize("mount", ["level", "body"])
 def test_all_kinds_draw_what_is_drawn_by_one_compiled_here(

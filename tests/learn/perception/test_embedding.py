@@ -31,6 +31,7 @@ from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.observation import MOTION_SIZE, Observation
 from tests.support.configs import TINY
+from tests.support.marks import in_whole
 from tests.support.miniature import miniature_world
 from tests.support.moving_boxes import frames
 
@@ -102,7 +103,7 @@ def moved(one, two) -> bool:
     return any(not np.array_equal(a, b) for a, b in pairs)
 
 
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("name", ["events", "ranges", *in_whole(*SENSORS[1:-2], "blind")])
 @pytest.mark.slow
 def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(traced, name: str) -> None:
     _, start, steps = traced(name)

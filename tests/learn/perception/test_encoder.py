@@ -271,6 +271,7 @@ def error_of(params, field):
     return jnp.mean(jnp.sum(jnp.square(image - vae.decoder_target(CONFIG, field)), axis=(-3, -2, -1)))
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_training_reconstructs_unseen_windows_better_than_any_constant(trained):
     before, after, losses, unseen = trained
@@ -281,6 +282,7 @@ def test_training_reconstructs_unseen_windows_better_than_any_constant(trained):
     assert np.all(np.isfinite(losses.kl)) and float(losses.kl[-1]) > 1.0
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_codes_tell_boxes_on_the_left_from_boxes_on_the_right(trained):
     _, after, _, _ = trained

@@ -19,6 +19,7 @@ from edqn_jax.native.products import in_precision
 from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task.observation import MOTION_SIZE
 from tests.oracles import event_fields, patch_encoder_plain
+from tests.support.marks import in_whole
 
 SMALL = CameraConfig(width=10, height=6)  # no multiple of a patch's side
 CONFIG = EncoderConfig(code_size=5, patch_layers=(6, 3), joint_layers=(8, 7))
@@ -163,7 +164,7 @@ def test_the_decoder_draws_what_the_target_holds(target, form, channels) -> None
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+@pytest.mark.parametrize("products", ["float32", *in_whole("bfloat16")])
 def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone(products: str) -> None:
     """A patch of k events at speed v stands for a nearness of k / (8 v): only both together tell it."""
     camera, config = CameraConfig(width=8, height=8), EncoderConfig(code_size=4, kl_weight=0.0, target_blur=0)
@@ -180,10 +181,10 @@ def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone(pro
         config, vae.decoder_target(config, fields, jnp.asarray(np.broadcast_to(near[:, None, None], (512, 8, 8))))
     )
 
-    def error_after(motion) -> float:
-        params = fresh(config, camera, jax.random.key(0))
-        optimiser = optax.adam(2e-3)
+    optimiser, params = optax.adam(2e-3), fresh(config, camera, jax.random.key(0))
 
+    @jax.jit
+    def train(motion):
         def update(carry, key):
             params, state = carry
             noise = jax.random.normal(key, (*wanted.beyond.shape, config.code_size))
@@ -193,11 +194,13 @@ def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone(pro
             return (optax.apply_updates(params, change), state), None
 
         keys = jax.random.split(jax.random.key(1), 150)
-        (params, _), _ = jax.jit(lambda c: jax.lax.scan(update, c, keys))((params, optimiser.init(params)))
-        made = vae.decode(config, camera, params, vae.embed(config, params, fields, motion))
-        return float(np.sqrt(np.mean((np.asarray(made)[:, 0].mean((1, 2)) - near) ** 2)))
+        (learnt, _), _ = jax.lax.scan(update, (params, optimiser.init(params)), keys)
+        return vae.decode(config, camera, learnt, vae.embed(config, learnt, fields, motion))
 
-    with_motion, without = error_after(jnp.asarray(motion)), error_after(jnp.zeros_like(motion))
+    with_motion, without = (
+        float(np.sqrt(np.mean((np.asarray(train(known))[:, 0].mean((1, 2)) - near) ** 2)))
+        for known in (motion, np.zeros_like(motion))
+    )
     assert with_motion < 0.5 * without, (with_motion, without)
 
 

@@ -17,9 +17,8 @@ from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.runs.checkpoints import sealed
 from edqn_jax.runs.checkpoints.params import POLICY, load_params, save_params
 from edqn_jax.runs.policies import load_policy, save_policy
+from tests.support.marks import in_whole
 from tests.support.policies import CONFIG, always
-
-FLIPS = 200
 
 
 def some_policy(value: float = 1.0) -> PolicyParams:
@@ -105,14 +104,15 @@ def test_a_policy_is_saved_into_no_folder_that_holds_files(tmp_path):
     assert same(load_params(tmp_path / "new" / "checkpoints"), some_policy())
 
 
-def test_no_flipped_bit_and_no_cut_file_of_a_policy_is_loaded(tmp_path: Path) -> None:
+@pytest.mark.parametrize("flips", [40, *in_whole(200)])
+def test_no_flipped_bit_and_no_cut_file_of_a_policy_is_loaded(flips: int, tmp_path: Path) -> None:
     whole = tmp_path / "whole"
     save_policy(Policy(CONFIG, always((1, 0, 0))), whole)
     load_policy(whole)
     files = sorted(path.relative_to(whole) for path in whole.rglob("*") if path.is_file())
     rng = np.random.default_rng(0)
     sizes = np.array([(whole / file).stat().st_size for file in files], float)
-    chosen = [*range(len(files)), *rng.choice(len(files), FLIPS - len(files), p=sizes / sizes.sum())]
+    chosen = [*range(len(files)), *rng.choice(len(files), flips - len(files), p=sizes / sizes.sum())]
     for number, index in enumerate(chosen):
         damaged = whole / files[index]
         held = damaged.read_bytes()

@@ -20,6 +20,7 @@ from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import Scene
 from tests.support.drawn_scenes import looking, rotation_of
+from tests.support.marks import in_whole
 from tests.support.meshes import CUBE, bracket, hull, mesh_world
 
 RING = trimesh.creation.torus(1.2, 0.3, major_sections=24, minor_sections=12)
@@ -80,7 +81,7 @@ def agree(config: CameraConfig, scene: Scene, seed: int) -> None:
     assert same.mean() > 1 - TIES / 2 and picture.std() > 0.05
 
 
-@pytest.mark.parametrize("mount", ["level", "body"])
+@pytest.mark.parametrize("mount", ["level", *in_whole("body")])
 @settings(max_examples=6, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(seed=st.integers(0, 2**16))
 def test_c_draws_fields_among_other_shapes_as_jax_does(world: Scene, mount: Any, seed: int) -> None:
@@ -88,7 +89,7 @@ def test_c_draws_fields_among_other_shapes_as_jax_does(world: Scene, mount: Any,
     agree(CameraConfig(mount=mount), world, seed)
 
 
-@pytest.mark.parametrize("mount", ["level", "body"])
+@pytest.mark.parametrize("mount", ["body", *in_whole("level")])
 def test_c_draws_other_sizes_and_numbers_of_rays_and_patterns(world: Scene, mount: Any) -> None:
     config = CameraConfig(width=13, height=7, samples_across=2, samples_down=3, mount=mount)
     agree(config, looking(world, 3), 1)

@@ -25,6 +25,7 @@ from edqn_jax.sim.scene.shapes import kind, plane
 from edqn_jax.sim.worlds import families
 from tests.support.camera_in_c import CONFIG, ROUNDING, TIES, crowd, frames, in_c
 from tests.support.drawn_scenes import GROUND, ball, box, every_kind, looking, pillar, rotation_of, scene_of
+from tests.support.marks import in_whole
 
 
 @partial(jax.jit, static_argnums=0)
@@ -87,6 +88,7 @@ def test_constants_are_the_same_in_c_and_in_python() -> None:
     assert whole == {name for name, place in places.items() if isinstance(getattr(place, name), int)}
 
 
+@pytest.mark.whole
 def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
     if not native.is_available("cpu"):
         return
@@ -100,7 +102,11 @@ def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
     assert (apart.max(axis=(1, 2)) > 0.05).mean() > 0.4  # the others' drones are behind something
 
 
-@pytest.mark.parametrize("size", [(32, 24), (13, 7)], ids=["usual", "no multiple of a vector"])
+SIZES = [(32, 24), *in_whole((13, 7))]
+"""The usual one, and one that is no multiple of a vector."""
+
+
+@pytest.mark.parametrize("size", SIZES)
 def test_c_draws_what_jax_draws(size: tuple[int, int]) -> None:
     config = dataclasses.replace(CONFIG, width=size[0], height=size[1])
     rng = np.random.default_rng(3)
@@ -135,6 +141,7 @@ def worlds() -> dict[str, list[Scene]]:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.whole
 @pytest.mark.slow
 def test_c_draws_the_worlds_of_a_family_as_jax_does(worlds: dict[str, list[Scene]], family: str) -> None:
     if native.is_available("cpu"):
@@ -147,8 +154,8 @@ def tilted_poses(rng: np.random.Generator, count: int) -> jax.Array:
     return jnp.asarray(np.stack([rotation_of(*tilt) for tilt in tilts]), jnp.float32)
 
 
-@pytest.mark.parametrize("size", [(32, 24), (13, 7)], ids=["usual", "no multiple of a vector"])
-@pytest.mark.parametrize("patterned", [False, True], ids=["plaid", "patterns"])
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("patterned", [False, *in_whole(True)])
 def test_c_draws_what_jax_does_of_a_camera_on_the_body(size: tuple[int, int], patterned: bool) -> None:
     if not native.is_available("cpu"):
         return
@@ -199,8 +206,13 @@ def empty_field(rng: np.random.Generator) -> Scene:
 
 @pytest.mark.parametrize(
     "size, world",
-    [((32, 24), crowd), ((13, 7), crowd), ((70, 20), crowd), ((32, 24), crowded_forest), ((32, 24), empty_field)],
-    ids=["usual", "no multiple of a block", "several blocks", "several passes", "no upright shapes"],
+    [
+        pytest.param((32, 24), crowd, id="usual"),
+        pytest.param((13, 7), crowd, id="no multiple of a block", marks=pytest.mark.whole),
+        pytest.param((70, 20), crowd, id="several blocks", marks=pytest.mark.whole),
+        pytest.param((32, 24), crowded_forest, id="several passes"),
+        pytest.param((32, 24), empty_field, id="no upright shapes"),
+    ],
 )
 def test_the_kernels_of_gpus_draw_what_jax_draws(
     kernels: bool, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], world: Callable[..., Scene]

@@ -160,6 +160,8 @@ def test_a_step_of_the_gusts_is_exact_at_any_length(dt):
     np.testing.assert_allclose(driven @ driven.T, noise, atol=1e-6, rtol=1e-3)
 
 
+@pytest.mark.whole
+@pytest.mark.slow
 def test_gusts_have_the_deviations_and_the_correlation_times_of_dryden_from_their_first_step_on():
     air = AirConfig(gusts_m_s=5.0, gust_height_m=3.048, gust_airspeed_m_s=20.0)  # quick, so that a run is long
     scales, dt, runs, steps = disturbances.gust_scales(air), 0.05, 256, 20_000
@@ -200,14 +202,17 @@ def test_gusts_have_the_deviations_and_the_correlation_times_of_dryden_from_thei
 # ------------------------------------------------------------------------------------------- flying
 
 
+# One program for flights of the same configuration, however many there are.
+fly, reset, step = (jax.jit(each, static_argnums=0) for each in (fly_disturbed, env.reset, env.step))
+
+
 def flown_disturbed(config: Config, disturbance: Disturbance, command, decisions: int, key=0):
     """State and disturbance after decisions at a held command, and all flights."""
     airframe = load_airframe(config.drone)
-    fly = jax.jit(lambda *given: fly_disturbed(config, airframe, *given))
     state, flights = hover_state(jnp.array([0.0, 0.0, 50.0]), jnp.float32(0.0)), []
     held = VelocityCommand(jnp.asarray(command, jnp.float32), jnp.float32(0.0))
     for each in jax.random.split(jax.random.key(key), decisions):
-        state, disturbance, flight = fly(state, disturbance, held, each)
+        state, disturbance, flight = fly(config, airframe, state, disturbance, held, each)
         flights.append(flight)
     return state, disturbance, flights
 
@@ -312,11 +317,10 @@ def world() -> env.EnvParams:
 
 def flown(config: Config, world: env.EnvParams, moves, seed: int = 0) -> tuple[list[Any], Any, list[Any]]:
     """States after a reset and after each move, the first observation, and what the moves led to."""
-    state, observation = jax.jit(partial(env.reset, config, world))(jax.random.key(seed))
-    step = jax.jit(partial(env.step, config, world))
+    state, observation = reset(config, world, jax.random.key(seed))
     states, steps = [state], []
     for move in moves:
-        state, result = step(state, move)
+        state, result = step(config, world, state, move)
         states.append(state)
         steps.append(result)
     return states, observation, steps

@@ -63,6 +63,7 @@ def test_the_ground_floor_is_the_same_mesh_below_its_ceiling() -> None:
     assert (volume.get("pos"), volume.get("size")) == ("12 7 2", "12 7 2")
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_drone_fits_and_sees_what_mujoco_sees() -> None:
     world = load_world(FILE)

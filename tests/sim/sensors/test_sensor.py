@@ -36,6 +36,7 @@ from tests.oracles import camera_plain
 from tests.oracles.mujoco_depth import RayCaster
 from tests.support.configs import TINY
 from tests.support.drawn_scenes import every_kind, free_points, rotation_of, scene_of
+from tests.support.marks import in_whole
 from tests.support.miniature import WORLD
 
 CAMERA = CameraConfig(width=16, height=12)
@@ -309,7 +310,7 @@ NEW = {
 }
 
 
-@pytest.fixture(params=NEW)
+@pytest.fixture(params=["row_means", *in_whole("negative", "tree")])
 def with_new_sensor(request, monkeypatch) -> Config:
     """A miniature that trains with a sensor that only the table knows."""
     monkeypatch.setitem(SENSORS._entries, request.param, NEW[request.param])

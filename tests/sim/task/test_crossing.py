@@ -43,7 +43,14 @@ def clearance(pool: Scene, points: np.ndarray) -> np.ndarray:
 # Each family and each number of drones; every pair would be another program to compile.
 @pytest.mark.parametrize(
     ("family", "drones"),
-    [("medium", 4), ("moving", 2), ("dense", 8), ("rooms", 4), ("forest", 8), ("canyon", 2)],
+    [
+        ("medium", 4),
+        ("moving", 2),
+        *(
+            pytest.param(*pair, marks=pytest.mark.whole)
+            for pair in (("dense", 8), ("rooms", 4), ("forest", 8), ("canyon", 2))
+        ),
+    ],
 )
 def test_starts_and_goals_are_free_apart_and_far_as_those_of_other_missions(family, drones):
     pool, start, goal = blocks_of(family, drones)

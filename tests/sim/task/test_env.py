@@ -488,6 +488,7 @@ FLOWN = dataclasses.replace(
         step_reward=-0.25,
         max_decisions=4,
     ),
+    drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"),  # is traced in less time
     events=EventsConfig(threshold=0.02, tolerance=0.02),  # there is little to see in this world
 )
 
@@ -732,7 +733,9 @@ def test_many_environments_at_once_are_the_same_as_one_by_one(reset, step):
 def test_no_key_is_used_twice_and_no_rank_is_promoted(world, law):
     # Leak checks do not get past MJX. Tracing is enough: both checks are made there.
     task = dataclasses.replace(FLOWN.env, reward="geodesic")
-    config = dataclasses.replace(FLOWN, env=task, events=EventsConfig(law=law, threshold_mismatch=0.1))
+    config = dataclasses.replace(
+        FLOWN, drone=CONFIG.drone, env=task, events=EventsConfig(law=law, threshold_mismatch=0.1)
+    )
     world = dataclasses.replace(world, distances=geodesic.distance_fields(world.pool, 0.36))
     with jax.numpy_rank_promotion("raise"), jax.debug_key_reuse(True):
         state, _ = jax.jit(partial(env.reset, config, world)).trace(jax.random.key(0)).out_info

@@ -311,6 +311,7 @@ def test_a_mission_has_its_balls_thrown_at_its_own_drone():
     assert Outcome.COLLISION in outcomes
 
 
+@pytest.mark.whole
 def test_the_clearance_of_a_flight_is_to_shapes_as_they_move():
     world = world_of(pillar(sliding(), x=14.0))
     flights = fly_missions(CONFIG, world, fresh_policy(CONFIG), jax.random.key(0), extras=Extras(record=True))

@@ -17,6 +17,7 @@ from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene
 from edqn_jax.sim.worlds import geodesic
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from tests.oracles import geodesic_plain
+from tests.support.marks import in_whole
 from tests.support.meshes import CUBE, hull, mesh_world
 from tests.support.small_worlds import RADIUS, WITHOUT_A_WAY, box, random_small_world, small_world
 
@@ -49,7 +50,7 @@ def test_lengths_are_those_that_dijkstra_finds(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["corridor", "courtyard", "flat", "storeys", "warehouse"])
+@pytest.mark.parametrize("name", ["corridor", *in_whole("courtyard", "flat", "storeys", "warehouse")])
 def test_the_way_from_the_start_is_about_as_long_as_astars(name):
     scene = load_scene(scenes_folder() / "examples" / f"{name}.xml")
     way = float(left(one(scene), jnp.int32(0), scene.goal, scene.start))
@@ -59,7 +60,7 @@ def test_the_way_from_the_start_is_about_as_long_as_astars(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", ["rooms", "forest", "canyon", "dense"])
+@pytest.mark.parametrize("family", ["dense", *in_whole("rooms", "forest", "canyon")])
 def test_worlds_of_a_pool_have_ways_of_their_own_and_none_is_shorter_than_the_straight_line(family):
     pool = random_pool(family, world_keys("validation", 3))
     fields = geodesic.distance_fields(pool, RADIUS)

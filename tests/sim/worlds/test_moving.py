@@ -132,6 +132,8 @@ def test_who_hovers_at_a_start_is_left_alone_for_two_seconds(pools, name):
                 assert float(_nearest(scene, point, times)) >= CLEARANCE - 0.5
 
 
+@pytest.mark.whole
+@pytest.mark.slow
 def test_no_worlds_own_start_is_swept_in_the_first_seconds():
     pool = random_pool("dense", world_keys("validation", 128), Moving(share=1.0, speed_m_s=5.0))
     times = jnp.arange(0, EARLY_S + 1e-6, 0.02)
@@ -152,7 +154,9 @@ def test_without_the_care_for_the_first_seconds_starts_would_be_swept(pools):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("family", "bodies"), [("forest", forest.BODIES), ("canyon", canyon.BODIES)])
+@pytest.mark.parametrize(
+    ("family", "bodies"), [("canyon", canyon.BODIES), pytest.param("forest", forest.BODIES, marks=pytest.mark.whole)]
+)
 def test_what_belongs_together_moves_together(family, bodies):
     pool = random_pool(family, KEYS[:3], Moving(share=0.6))
     for i in range(3):
@@ -180,6 +184,7 @@ def test_meshes_of_a_family_of_ones_own_move(monkeypatch: pytest.MonkeyPatch) ->
     assert np.all(np.linalg.norm(away, axis=2) > 0.1) and np.all(away[..., 2] == 0)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_walls_of_rooms_stand_while_balls_are_thrown():
     pool = random_pool("rooms", KEYS[:2], Moving(share=1.0, balls=2))
@@ -187,6 +192,7 @@ def test_walls_of_rooms_stand_while_balls_are_thrown():
     assert pool.spheres.radius.shape == (2, 2)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_moving_world_of_a_mixture_is_that_of_its_family():
     moving = Moving(share=0.5, balls=1)
@@ -243,13 +249,13 @@ def test_no_ball_comes_near_the_start_in_the_first_seconds(pools):
 
 
 @pytest.mark.slow
-def test_moving_worlds_reuse_no_key_and_promote_no_rank():
+@pytest.mark.parametrize("family", ["sparse", pytest.param("forest", marks=pytest.mark.whole)])
+def test_moving_worlds_reuse_no_key_and_promote_no_rank(family):
     with jax.debug_key_reuse(True), jax.numpy_rank_promotion("raise"), jax.checking_leaks():
-        for family in ("sparse", "forest"):
-            # Not by `random_pool`, which draws in threads, where none of this holds.
-            pool = families._sample_worlds(family, world_keys("training", 2), EVERYTHING)
-            random_missions(pool, 4, jax.random.key(0))
-            jax.jit(lambda pool: scene_at(take_scene(pool, 0), jnp.float32(1.0)))(pool)
+        # Not by `random_pool`, which draws in threads, where none of this holds.
+        pool = families._sample_worlds(family, world_keys("training", 2), EVERYTHING)
+        random_missions(pool, 4, jax.random.key(0))
+        jax.jit(lambda pool: scene_at(take_scene(pool, 0), jnp.float32(1.0)))(pool)
 
 
 def test_environments_and_evaluations_fly_in_what_the_configuration_says():

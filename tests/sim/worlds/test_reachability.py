@@ -41,9 +41,10 @@ def world(seed: int) -> Scene:
 
 
 @pytest.mark.slow
-def test_it_says_what_the_plain_one_says_and_finds_no_way_that_astar_does_not():
+@pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 14), marks=pytest.mark.whole)])
+def test_it_says_what_the_plain_one_says_and_finds_no_way_that_astar_does_not(seeds):
     found = []
-    for seed in range(14):
+    for seed in seeds:
         scene = world(seed)
         found.append(bool(quick(scene)))
         assert found[-1] == ways_plain.has_way(scene, SIZE, RADIUS, EDGE), seed
@@ -54,7 +55,7 @@ def test_it_says_what_the_plain_one_says_and_finds_no_way_that_astar_does_not():
             wider = RADIUS + EDGE / 2 + EDGE
             with pytest.raises(NoPathError):
                 shortest_path(scene, scene.start, scene.goal, wider)
-    assert 4 <= sum(found) <= 10, found
+    assert 0 < sum(found) < len(seeds), found
 
 
 def test_a_world_higher_than_a_word_is_refused():
