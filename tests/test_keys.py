@@ -76,6 +76,7 @@ def test_runs_of_two_seeds_share_no_stream_but_worlds_and_evaluation_missions() 
         assert not data[0] & data[1], stream
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_run_derives_its_keys_from_its_streams_alone() -> None:
     """The environments of a run begin with the keys of the list above."""

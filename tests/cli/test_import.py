@@ -44,12 +44,13 @@ def test_help_lists_what_a_file_or_a_module_registers_and_a_run_takes_it(tmp_pat
     ("name", "text", "says"),
     [
         ("nowhere.py", None, "there is no file 'nowhere.py'"),
-        ("nowhere", None, "there is no module 'nowhere'; give a file"),
+        pytest.param("nowhere", None, "there is no module 'nowhere'; give a file", marks=pytest.mark.whole),
         ("early.py", "import jax.numpy as jnp\njnp.zeros(3)", "'early.py' computes with JAX while it is imported"),
-        (
+        pytest.param(
             "twice.py",
             2 * SENSOR,
             "'twice.py' does not load: the sensor 'mine' is there already; give yours another name, l",
+            marks=pytest.mark.whole,
         ),
         ("fails.py", "raise ValueError('two\\nlines')", "'fails.py' does not load: ValueError: two\\nlines, line 1"),
     ],

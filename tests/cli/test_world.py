@@ -13,6 +13,7 @@ from edqn_jax.devices import devices
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of
 from edqn_jax.sim.scene.scans import scan
 from edqn_jax.sim.scene.scans.point_files import read_points
+from tests.support.marks import in_whole
 from tests.support.octomaps import octomap_of
 
 ROOM = (8.0, 5.0, 3.0)
@@ -57,7 +58,7 @@ def test_a_closed_mesh_is_a_world(capsys: pytest.CaptureFixture[str]) -> None:
     flown_inside("here")
 
 
-@pytest.mark.parametrize("kind", ["stl", "glb"])
+@pytest.mark.parametrize("kind", ["glb", *in_whole("stl")])
 def test_scale_and_the_axis_that_points_up_are_taken(kind: str) -> None:
     mesh = room()
     mesh.apply_scale(1000)

@@ -81,6 +81,7 @@ def test_the_events_are_those_that_the_drone_got(sights, flight):
     assert shown.target.min() > -1e-5
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_what_slow_photoreceptors_show_of_the_first_decision_follows_the_start():
     events = dataclasses.replace(SMALL.events, bandwidth_hz=8.0, threshold=0.003, tolerance=0.003)

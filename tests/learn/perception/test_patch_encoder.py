@@ -216,7 +216,7 @@ def test_the_gradient_of_rounded_products_is_near_that_of_plain_ones() -> None:
 
     def gradient(name: str) -> np.ndarray:
         with in_precision(name):
-            found = jax.grad(lambda p: vae.vae_loss(config, p, fields, motion, wanted, noise)[0])(params)
+            found = jax.jit(jax.grad(lambda p: vae.vae_loss(config, p, fields, motion, wanted, noise)[0]))(params)
         return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(found)])
 
     plain, rounded = gradient("float32"), gradient("bfloat16")

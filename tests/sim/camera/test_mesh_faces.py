@@ -12,13 +12,14 @@ import pytest
 from edqn_jax.config import CameraConfig
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.scene.mjcf import load_scene
+from tests.support.marks import in_whole
 from tests.support.meshes import CUBE, hull, mesh_world
 
 SIZES = np.array([[6.0, 3.0, 0.4], [6.0, 0.3, 2.0]])
 PLACES = np.array([[10.0, 5.0, 1.0], [10.0, 8.3, 2.6]])
 
 
-@pytest.mark.parametrize("mount", ["level", "body"])
+@pytest.mark.parametrize("mount", ["body", *in_whole("level")])
 def test_the_texture_of_faces_seen_at_a_low_angle_is_averaged_as_that_of_boxes(mount: str, tmp_path: Path) -> None:
     """A floor and a wall, both 12 m long, and an eye close to them."""
     text = [" ".join(map(str, size)) for size in SIZES]

@@ -45,10 +45,9 @@ def clearance(pool: Scene, points: np.ndarray) -> np.ndarray:
     ("family", "drones"),
     [
         ("medium", 4),
-        ("moving", 2),
         *(
             pytest.param(*pair, marks=pytest.mark.whole)
-            for pair in (("dense", 8), ("rooms", 4), ("forest", 8), ("canyon", 2))
+            for pair in (("moving", 2), ("dense", 8), ("rooms", 4), ("forest", 8), ("canyon", 2))
         ),
     ],
 )

@@ -751,9 +751,9 @@ def test_nobody_is_paid_for_a_way_through_a_wall():
     fields = geodesic.distance_fields(pool, 0.36)
     world = env.EnvParams(load_airframe(CONFIG.drone), pool, own_missions(pool), distances=fields)
     task = EnvConfig(sensor="blind", reward="geodesic", progress_weight=1.0, path_weight=0.0, step_reward=0.0)
-    config = dataclasses.replace(CONFIG, env=task)
+    config = dataclasses.replace(CONFIG, drone=FLOWN.drone, env=task)
     step = jax.jit(partial(env.step, config, world))
-    state, _ = env.reset(config, world, jax.random.key(0))
+    state, _ = jax.jit(partial(env.reset, config, world))(jax.random.key(0))
     left = [float(geodesic.distance_to_goal(fields, jnp.int32(0), scene.goal, state.drone.position))]
     while not state.ended:
         before = state.drone.position

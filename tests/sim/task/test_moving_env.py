@@ -31,6 +31,7 @@ from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.drawn_scenes import GROUND
+from tests.support.marks import in_whole
 
 CONFIG = make_config(
     "medium",
@@ -107,7 +108,7 @@ def test_events_are_where_the_obstacles_edges_are(hovered):
     assert int(states[4].decision) == 4
 
 
-@pytest.mark.parametrize("name", ["frames", "frame-pair", "depth", "ranges"])
+@pytest.mark.parametrize("name", ["frame-pair", "ranges", *in_whole("frames", "depth")])
 def test_every_frame_sees_the_world_at_its_own_time(name):
     config, world = configured(name), world_of(pillar(sliding()))
     _, first, steps = fly(world, [HOVER] * 3, config)

@@ -106,7 +106,7 @@ def test_start_and_goal_are_free_and_far_apart(pools, family):
         check_scene(take_scene(pool, i), RADIUS)
 
 
-@pytest.mark.parametrize("family", ["sparse", "medium", "dense", "rooms", *in_whole("forest", "canyon")])
+@pytest.mark.parametrize("family", ["sparse", "rooms", *in_whole("medium", "dense", "forest", "canyon")])
 @pytest.mark.slow
 def test_there_is_a_path_in_every_random_world(pools, family):
     for i in range(2):
@@ -244,7 +244,7 @@ def test_an_unknown_family_names_the_nearest_or_those_there_are():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", ["sparse", "rooms", *in_whole("forest", "canyon")])
+@pytest.mark.parametrize("family", ["sparse", *in_whole(*HARD)])
 def test_worlds_and_missions_reuse_no_key_and_promote_no_rank(family):
     with jax.debug_key_reuse(True), jax.numpy_rank_promotion("raise"), jax.checking_leaks():
         # Not by `random_pool`, which draws in threads, where none of this holds.
