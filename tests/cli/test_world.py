@@ -85,6 +85,8 @@ def test_what_is_not_closed_has_a_thickness(capsys: pytest.CaptureFixture[str]) 
     assert load_world(again).scene.others["fields"].grids[0].thickness == pytest.approx(0.1)
 
 
+@pytest.mark.whole
+@pytest.mark.slow
 def test_a_cloud_of_points_has_a_thickness(capsys: pytest.CaptureFixture[str]) -> None:
     points = trimesh.sample.sample_surface(room(), 40_000, seed=1)[0]
     trimesh.PointCloud(points).export("cloud.ply")
@@ -170,6 +172,8 @@ def test_points_that_cannot_be_a_world_are_refused_in_a_sentence(
     assert says in said and said.count("\n") == 1 and not Path("here").exists()
 
 
+@pytest.mark.whole
+@pytest.mark.slow
 def test_an_octomap_is_a_world(capsys: pytest.CaptureFixture[str]) -> None:
     x, y, z = np.indices((80, 50, 30))
     walls = (np.minimum(x, 79 - x) < 2) | (np.minimum(y, 49 - y) < 2) | (np.minimum(z, 29 - z) < 2)

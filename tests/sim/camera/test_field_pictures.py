@@ -89,7 +89,8 @@ def test_c_draws_fields_among_other_shapes_as_jax_does(world: Scene, mount: Any,
     agree(CameraConfig(mount=mount), world, seed)
 
 
-@pytest.mark.parametrize("mount", ["body", *in_whole("level")])
+@pytest.mark.whole
+@pytest.mark.parametrize("mount", ["level", "body"])
 def test_c_draws_other_sizes_and_numbers_of_rays_and_patterns(world: Scene, mount: Any) -> None:
     config = CameraConfig(width=13, height=7, samples_across=2, samples_down=3, mount=mount)
     agree(config, looking(world, 3), 1)

@@ -110,6 +110,8 @@ def over_all(moved: Any) -> Any:
     return jax.vmap(jax.vmap(moved, in_axes=(None, 0)), in_axes=(0, None))
 
 
+@pytest.mark.whole
+@pytest.mark.slow
 def test_frames_and_worlds_that_are_mapped_are_those_one_by_one(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     moved = meet_moved(file)
     depth, *_ = compare(monkeypatch, over_all(moved), SHIFTS, ORIGINS)
@@ -130,6 +132,8 @@ def kernel() -> bool:
     )
 
 
+@pytest.mark.whole
+@pytest.mark.slow
 def test_the_kernel_of_gpus_meets_what_c_meets(kernel: bool, file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the CPU, thread by thread."""
     if not kernel:

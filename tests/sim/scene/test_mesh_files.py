@@ -51,6 +51,8 @@ def rays_down(file: Path, count: int = 150) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points), np.array(geoms)
 
 
+@pytest.mark.whole
+@pytest.mark.slow
 def test_what_mujoco_sees_of_files_ellipsoids_and_height_fields_is_the_surface_of_fields(tmp_path: Path) -> None:
     folder = tmp_path / "meshes"
     folder.mkdir()

@@ -170,10 +170,11 @@ def gaps_along(mesh: MovedMesh, path: np.ndarray, times: np.ndarray, each: int) 
     return np.array(gaps) - RADIUS
 
 
-def test_what_it_runs_into_is_touched_when_its_triangles_touch_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("flights", "least"), [(12, 1), pytest.param(30, 5, marks=pytest.mark.whole)])
+def test_what_it_runs_into_is_touched_when_its_triangles_touch_it(flights: int, least: int, tmp_path: Path) -> None:
     rng, each = np.random.default_rng(0), 8
     touched = free = 0
-    for _ in range(30):
+    for _ in range(flights):
         mesh = drawn_mesh(rng)
         scene = world_of(tmp_path, mesh)
         times = (rng.uniform(0, 9) + 0.02 * np.arange(14)).astype(np.float32)
@@ -194,7 +195,7 @@ def test_what_it_runs_into_is_touched_when_its_triangles_touch_it(tmp_path: Path
             assert np.interp(stated * each, np.arange(len(gaps)), gaps) < SLACK_M
             assert not len(late) or stated < late[0] + 0.2, (stated, late[0])
             touched += len(late) > 0
-    assert touched > 4 and free > 4, (touched, free)
+    assert touched >= least and free >= least, (touched, free)
 
 
 def test_what_is_written_moves_alike_and_so_does_a_pool_of_worlds(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 import trimesh
@@ -12,6 +14,7 @@ from edqn_jax.sim.scene.grid_boxes import MOST_BOXES, boxes_of_grid
 from edqn_jax.sim.scene.mesh_field import CELL_M, Grid, _cell_for, grid_of_mesh
 from edqn_jax.sim.scene.solid_distance import EXACT_CELLS, lattice_axes, points_on, solid_distances, split_triangles
 from tests.oracles.mesh_distance import signed_distances
+from tests.support.marks import in_whole
 
 TURN = Rotation.from_euler("xyz", [20, 35, 50], degrees=True).as_matrix()
 
@@ -77,8 +80,13 @@ def test_far_from_many_things_no_distance_is_too_large() -> None:
     assert error.size > 100_000 and error.max() < 1e-5 and error.min() > -0.012
 
 
-@pytest.mark.parametrize("name", MESHES)
-@pytest.mark.parametrize("turned", [False, True], ids=["straight", "turned"])
+EVERY_DAY = [("ring", False), ("walls", True)]
+OTHERS = [each for each in itertools.product(MESHES, (False, True)) if each not in EVERY_DAY]
+
+
+@pytest.mark.parametrize(
+    ("name", "turned"), [*EVERY_DAY, *(pytest.param(*each, marks=pytest.mark.whole) for each in OTHERS)]
+)
 def test_between_its_values_a_grid_is_hardly_ever_half_a_cell_too_small_and_never_too_large(
     name: str, turned: bool
 ) -> None:
@@ -98,7 +106,7 @@ def test_between_its_values_a_grid_is_hardly_ever_half_a_cell_too_small_and_neve
     assert outside.min() > -0.1 and np.mean(outside < -0.05) < 0.03
 
 
-@pytest.mark.parametrize("name", BOXES)
+@pytest.mark.parametrize("name", ["sheets", *in_whole("steps", "walls")])
 def test_of_1e5_points_outside_boxes_hardly_any_distance_is_half_a_cell_off(name: str) -> None:
     mesh, bounds = boxes(*BOXES[name]), np.array(BOXES[name])
     grid, middle = grid_of_mesh(mesh.vertices @ TURN.T, mesh.faces, CELL_M)

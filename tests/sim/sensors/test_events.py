@@ -32,6 +32,7 @@ from tests.support.event_frames import (
     random_frames,
     run,
 )
+from tests.support.marks import in_whole
 
 BINDING = dataclasses.replace(ESIM, refractory_ns=6e6)
 LAWS = {"paper": PAPER, "airsim": AIRSIM, "esim": ESIM, "binding esim": BINDING}
@@ -135,7 +136,7 @@ def test_a_change_must_exceed_the_threshold():
     np.testing.assert_array_equal(events.event_polarity(-change, threshold), [0, 0, -1])
 
 
-@pytest.mark.parametrize("pixels", [1, 9])
+@pytest.mark.parametrize("pixels", [9, *in_whole(1)])
 @pytest.mark.parametrize("faults_share", [0.0, 1.0])
 def test_the_dvs_flies_with_any_refractory_period(pixels, faults_share):
     """None, v2e's 0.5 ms and 10 ms."""

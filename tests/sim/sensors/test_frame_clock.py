@@ -31,6 +31,8 @@ few = settings(max_examples=15, deadline=None, derandomize=True)
 PAIR = (-0.04, 0.0)
 DT = 0.02
 
+poses_of_frames = jax.jit(exposure.poses_of_frames, static_argnums=(0, 4))
+
 
 def config_of(rate: float, latency: float, steps: int = 13, name: str = "frames", **exposed) -> Config:
     return Config(
@@ -66,7 +68,7 @@ def test_each_decision_sees_the_newest_frame_that_is_there_from_where_it_was_tak
         now = decision * steps * DT
         if decision:
             poses = flight_of(path, (decision - 1) * steps, steps)
-        taken, clock = exposure.poses_of_frames(config, clock, poses, jnp.zeros(()), PAIR)
+        taken, clock = poses_of_frames(config, clock, poses, jnp.zeros(()), PAIR)
         # A hair later, since a frame may come at the very time of a decision.
         end = frame_clock_plain.newest_end(now + 1e-5, rate, phase, latency)
         wanted = [frame_clock_plain.place_at(time, path, DT) for time in (end - apart, end)]

@@ -29,7 +29,7 @@ from edqn_jax.learn import actor, policy
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import stack_scenes
-from edqn_jax.sim.sensors import contrast, event_field, event_laws, event_memory, light, photoreceptor
+from edqn_jax.sim.sensors import contrast, event_field, light, photoreceptor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
@@ -212,10 +212,7 @@ def test_a_policy_acts_on_events_with_and_without_noise():
     frames = jnp.exp(jnp.asarray(np.random.default_rng(0).normal(-1.0, 0.3, (2, 12, 16)))).clip(0.0, 1.0)
     seen = []
     for config in (quiet, noisy):
-        memory = event_memory.reset_memory(config.events, 12, 16, jax.random.key(0))
-        field, _ = event_laws.generate_events(
-            config.events, memory, frames, config.events.frame_times_s, jax.random.key(1)
-        )
+        field, _ = run(config.events, memory_of(config.events, 0, 12, 16), frames, config.events.frame_times_s)
         seen.append(Observation(field, jnp.ones(OWN_SIZE), jnp.ones(MOTION_SIZE)))
     assert seen[0].sensed.count.shape[0] * 2 == seen[1].sensed.count.shape[0] == 2
     codes = [flies.code(each) for each in seen]

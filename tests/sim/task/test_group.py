@@ -266,6 +266,8 @@ def test_the_label_shows_the_others_where_they_are_after_the_decision():
 # ------------------------------------------------------------------------------------------- groups
 
 
+@pytest.mark.whole
+@pytest.mark.slow
 def test_another_order_of_the_drones_in_a_group_gives_the_same_flights_in_that_order():
     config = configured(3)
     ends = [((10, 20, 6), (50, 20, 6)), ((30, 20.3, 6), (2, 20.3, 6)), ((20, 10, 6), (20, 36, 6))]

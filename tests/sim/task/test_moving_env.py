@@ -134,6 +134,8 @@ def test_every_frame_sees_the_world_at_its_own_time(name):
         np.testing.assert_allclose(observed.sensed, expected, atol=2e-3, err_msg=f"{decision}")
 
 
+@pytest.mark.whole
+@pytest.mark.slow
 def test_true_depth_with_the_obstacles_motion_shows_who_comes_and_not_that_the_drone_flies():
     config, ahead = configured("depth-motion"), move_number("ahead")
     coming = UprightBoxes([30.0, 20, 6], [1, 2, 6], 0.0, GREY, motion=sliding((-3.0, 0.0, 0.0)))

@@ -59,8 +59,9 @@ def test_the_way_from_the_start_is_about_as_long_as_astars(name):
     assert 0.97 * shortest < way < 1.15 * shortest
 
 
+@pytest.mark.whole
 @pytest.mark.slow
-@pytest.mark.parametrize("family", ["dense", *in_whole("rooms", "forest", "canyon")])
+@pytest.mark.parametrize("family", ["rooms", "forest", "canyon", "dense"])
 def test_worlds_of_a_pool_have_ways_of_their_own_and_none_is_shorter_than_the_straight_line(family):
     pool = random_pool(family, world_keys("validation", 3))
     fields = geodesic.distance_fields(pool, RADIUS)
