@@ -19,6 +19,7 @@ from PIL import Image
 
 from edqn_jax.cli import main
 from edqn_jax.config import Config
+from edqn_jax.devices import devices
 from edqn_jax.report.page import document
 from edqn_jax.report.page.contents import COLUMNS, _by_interest, flight_data, learning_curves, script_text
 from edqn_jax.report.page.evaluated import EvaluatedRun, folders_of, names_of
@@ -197,7 +198,8 @@ def test_the_folder_of_several_seeds_stands_for_each_of_them(tmp_path: Path) -> 
         (["pretrained", "--mission", "1"], "did you mean '--missions'?"),
     ],
 )
-def test_what_cannot_be_shown_is_refused_with_one_sentence(arguments, says, tmp_path, capsys) -> None:
+def test_what_cannot_be_shown_is_refused_with_one_sentence(arguments, says, tmp_path, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     assert main(["report", *(word.format(tmp_path) for word in arguments)]) == 2
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
@@ -210,6 +212,7 @@ def test_a_run_whose_files_are_damaged_is_refused(tmp_path, monkeypatch, capsys)
     (tmp_path / "config.yaml").write_text("train: {seed: 0}")
     (tmp_path / "metrics.jsonl").write_text("{not JSON")
     monkeypatch.setattr(evaluated, "load_run", lambda folder: (Config(), jnp.zeros(())))
+    monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     assert main(["report", str(tmp_path)]) == 2
     assert "is not as a run writes it" in capsys.readouterr().err
     assert not (tmp_path / "report.html").exists()
