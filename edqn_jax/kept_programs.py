@@ -116,9 +116,12 @@ class Place:
             return [each.compile(options) for each in traced]
         numbers, compiled, found = [device.id for device in devices], [], []
         for each in traced:
-            texts = each.as_text(), repr((sorted((options or {}).items()), numbers)), *_surroundings()
+            infos, form = jax.tree.flatten(each.args_info)
+            trees = form, each.out_tree
+            # Arguments that are not used are not in the text, and yet must be those that the program was made for.
+            called = str((trees, [(info.shape, info.dtype, info.donated) for info in infos]))
+            texts = each.as_text(), called, repr((sorted((options or {}).items()), numbers)), *_surroundings()
             name = f"{name_of(*(text.encode() for text in texts))}.executable"
-            trees = jax.tree.structure(each.args_info), each.out_tree
             program = _load(self.file.parent / name, *trees, numbers)
             if program is None:
                 program = _compile_and_keep(self.file.parent / name, each, options)

@@ -111,6 +111,20 @@ def test_programs_are_told_apart_by_what_they_are_made_of(folder: Path, monkeypa
     assert len({each.file for each in [place(), *others]}) == 7
 
 
+def test_one_text_with_other_arguments_is_another_program(folder: Path) -> None:
+    def first(values: jax.Array, unused: Any) -> jax.Array:
+        return values + 1
+
+    values = jnp.arange(3.0)
+    first.__name__ = f"first_{time.time_ns()}"  # or JAX has it from an earlier session, and it is not kept
+    for unused in (values, values[1:], (values, values)):
+        for _ in range(2):
+            here, traced = place(arguments=(values, unused)), jax.jit(first).lower(values, unused)
+            [added] = here.load() or here.compile([traced], jax.devices()[:1])
+            assert added(values, unused).tolist() == [1, 2, 3]
+    assert len(list(folder.glob("*.executable"))) == len(list(folder.glob("*.program"))) == 3
+
+
 def test_nothing_is_kept_beside_code_of_users(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert place().file is not None
     assert place(made_of=[lambda: None]) == Place(None)
