@@ -34,7 +34,7 @@ def write_kept(file: Path, content: bytes) -> None:
 
 
 def kept_array(folder: Path | None, name: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-    """Returns an array that is kept in a folder by this name, else the one made now, and keeps it.
+    """Returns an array [...] that is kept in a folder by this name, else the one made now, and keeps it.
 
     Args:
         folder: None if nothing is kept.
