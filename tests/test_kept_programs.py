@@ -56,7 +56,7 @@ def lines_of(folder: Path, made_of: str = "one", **variables: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-@pytest.mark.slow
+@pytest.mark.whole
 def test_a_program_is_traced_once_and_damaged_ones_again(tmp_path: Path) -> None:
     [traced, result] = lines_of(tmp_path)
     assert traced == "traced" and lines_of(tmp_path) == [result]
@@ -70,6 +70,7 @@ def test_a_program_is_traced_once_and_damaged_ones_again(tmp_path: Path) -> None
     assert lines_of(tmp_path, EDQN_JAX_NATIVE="0")[0] == "traced"
 
 
+@pytest.mark.whole
 def test_what_jax_has_kept_is_not_kept_again_and_runs(tmp_path: Path) -> None:
     """XLA writes a program that it has loaded itself without its functions, so that it could not be run."""
     [_, result] = lines_of(tmp_path)
