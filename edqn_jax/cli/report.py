@@ -80,7 +80,7 @@ def report_command(args: ReportArgs) -> None:
 
         page = flight_page(args.runs[0]).encode()
     else:
-        show_phase("reading the runs")
+        show_phase("preparing worlds")
 
         from edqn_jax.report.page.document import build_report
 

@@ -64,7 +64,7 @@ def verdict(summary: dict[str, Any], run: RunDirectory, config: Config) -> str:
 def _next_commands(summary: dict[str, Any], run: RunDirectory, config: Config) -> str:
     """Returns the commands that show a run, fly it and go on with it, a line each."""
     flies = run.of_seed(summary["seeds"][0]).path if "seeds" in summary else run.path
-    more = 2 * config.train.total_steps
+    more = 2 * max(config.train.total_steps, summary["train_decisions"])
     return "\n".join(
         (
             f"see it:       edqn report {_word(run.path)}{_imports()}",

@@ -113,7 +113,8 @@ def train_run(
             if seeds is not None:
                 run.write_summary(summary)
             progress.stop()
-            told = summary | {"total_seconds": progress.elapsed_s}  # with what passed before worlds were prepared
+            # With what passed before worlds were prepared; of a run that was continued with what passed before that.
+            told = summary | {"total_seconds": max(progress.elapsed_s, summary["total_seconds"])}
             progress.message(messages.verdict(told, run, config))
     return summary
 

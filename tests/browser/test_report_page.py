@@ -59,13 +59,14 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Opened:
     """A page that is open, what it logged and what it asked for."""
 
-    def __init__(self, browser: Any, file: Path, size: dict[str, int]) -> None:
+    def __init__(self, browser: Any, file: Path, size: dict[str, int], first: str = "") -> None:
         self.said: list[str] = []
         self.asked: list[str] = []
         self.page = browser.new_page(viewport=size)
         self.page.on("console", lambda said: self.said.append(f"{said.type}: {said.text}"))
         self.page.on("pageerror", lambda error: self.said.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.add_init_script(first)
         self.page.goto(file.as_uri())
         self.until("document.querySelectorAll('#panels canvas').length === 4")
         self.page.wait_for_timeout(500)
@@ -111,6 +112,14 @@ def test_it_draws_the_world_and_what_the_drone_saw(opened: Opened) -> None:
             number,
         )
         assert min(ink[3::4]) == 255, number  # every pixel is painted
+
+
+def test_it_draws_where_the_browser_names_no_language(browser: Any, page_file: Path) -> None:
+    """As Chromium does in a POSIX locale."""
+    named = "Object.defineProperty(navigator, 'language', { value: 'en-US@posix', configurable: true })"
+    there = Opened(browser, page_file, DESK, named)
+    assert there.said == [] and there.page.evaluate("document.querySelectorAll('.uplot canvas').length") > 0
+    there.page.close()
 
 
 def test_it_opens_where_most_is_seen_and_plays_from_the_start(opened: Opened) -> None:

@@ -16,6 +16,7 @@ from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.messages import describe_stop, verdict
 
 CONFIG = make_config("medium", train={"total_steps": 4096, "validation_missions": 64})
+FLOWN = 5120  # whole chunks, more than was asked for
 
 ONE: dict[str, Any] = {
     "outcome": "collision",
@@ -30,6 +31,7 @@ ONE: dict[str, Any] = {
     "parameters_from_decisions": 4096,
     "total_seconds": 70.0,
     "train_seconds": 60.0,
+    "train_decisions": FLOWN,
 }
 
 SEEDS: dict[str, Any] = {
@@ -44,6 +46,7 @@ SEEDS: dict[str, Any] = {
     "flown_successes": 1,
     "total_seconds": 70.0,
     "train_seconds": 60.0,
+    "train_decisions": FLOWN,
 }
 
 
@@ -71,7 +74,7 @@ def test_the_last_lines_are_commands_that_work_in_any_folder(
     assert parse_report(report[2:]).runs == (run.path,)
     assert parse_evaluate(evaluate[2:]).run == run.path / flies
     options, config = parse_train(train[2:])
-    assert (options.run_dir, config.train.total_steps) == (run.path, 8192)
+    assert (options.run_dir, config.train.total_steps) == (run.path, 2 * FLOWN)
 
 
 def test_the_next_commands_import_what_this_one_did(monkeypatch: pytest.MonkeyPatch) -> None:

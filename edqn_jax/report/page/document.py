@@ -26,7 +26,7 @@ MAX_BYTES = 15_000_000
 MAX_FLIGHTS = 256
 """Flights of all runs of a page together at most."""
 
-_LIBRARIES = ("three.min.js", "uPlot.iife.min.js")
+_LIBRARIES = ("language.js", "vendored/three.min.js", "vendored/uPlot.iife.min.js")
 
 
 Shown = str | Path | Policy | FunctionPolicy | Function
@@ -113,7 +113,7 @@ def build_html(runs: Sequence[EvaluatedRun], data: dict[str, Any]) -> str:
         "comparison": comparison_table(runs),
         "options": options_table(runs),
         "style": _asset("vendored/uPlot.min.css") + _asset("page.css"),
-        "libraries": "".join(f"<script>{_asset(f'vendored/{name}')}</script>" for name in _LIBRARIES),
+        "libraries": "".join(f"<script>{_asset(name)}</script>" for name in _LIBRARIES),
         "data": script_text(data),
         "script": _asset("page.js"),
     }
