@@ -64,7 +64,8 @@ class Exploration(NamedTuple):
     advice: Array | None = None  # [S, E] moves of the teacher here; None without one
 
 
-class Teacher(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Teacher:
     """A policy that advises a learner in training."""
 
     config: Config

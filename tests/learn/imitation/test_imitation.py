@@ -78,7 +78,8 @@ def test_the_stored_advice_is_what_the_teacher_decides_where_it_flies_itself(mou
     save_policy(decisive(small(env={"sensor": "depth"}, agent={"history": 3}, camera=camera)), tmp_path / "depth")
     half = {"teacher_moves": 0.5, "teacher_fraction": 1.0}
     steps, config = 40, student(tmp_path / "depth", imitation=half, camera=camera)
-    world, plan, (teacher, params) = miniature_world(config), Schedule.from_config(config), load_teacher(config)
+    world, plan, taught = miniature_world(config), Schedule.from_config(config), load_teacher(config)
+    teacher, params = taught.config, taught.params
     state = jax.jit(lambda key: init_training(config, world, key))(jax.random.key(0))
     learn = jax.jit(partial(train_step, config, world, None))
     flat = partial(jax.tree.map, lambda x: x.reshape(-1, *x.shape[2:]))
