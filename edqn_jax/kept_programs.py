@@ -46,6 +46,9 @@ SOURCES = (".c", ".cu", ".h", ".py")
 DEPENDENCIES = ("flax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy", "optax")
 
 
+_had: dict[Path, list[jax.stages.Compiled]] = {}  # what `Place.load_or_compile` has returned
+
+
 @dataclasses.dataclass(frozen=True)
 class Place:
     """Where programs are found that belong together. They lie beside it, by what XLA compiles them from.
@@ -57,8 +60,8 @@ class Place:
     """None if they are not kept."""
 
     def holds_programs(self) -> bool:
-        """Returns whether programs are found here."""
-        return self.file is not None and self.file.is_file()
+        """Returns whether `load_or_compile` need not trace, unless what is found here cannot be loaded."""
+        return self.file is not None and (self.file in _had or self.file.is_file())
 
     def load(self) -> list[jax.stages.Compiled] | None:
         """Returns the programs; None if there are none, or they cannot be loaded, and are to be compiled."""
@@ -75,20 +78,10 @@ class Place:
         found = [each for each in loaded if each is not None]
         return found if len(found) == len(loaded) else None
 
-    def named(self, function: Callable[Given, Returned]) -> Callable[Given, Returned]:
-        """Returns the function with a name of its own, if it is kept.
-
-        JAX's cache tells programs apart by it; and one that XLA has loaded from there it writes without its functions,
-        so that it could be run and not kept.
-        """
-        if self.file is None:
-            return function
-
-        def named(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
-            return function(*args, **kwargs)
-
-        named.__name__ = f"kept_{self.file.name.partition('-')[0]}"
-        return named
+    @property
+    def name(self) -> str | None:
+        """Name for the functions of its programs, see `named`; None if they are not kept."""
+        return None if self.file is None else f"kept_{self.file.name.partition('-')[0]}"
 
     def load_or_compile(
         self,
@@ -96,8 +89,12 @@ class Place:
         devices: Sequence[Any],
         options: dict[str, str | bool] | None = None,
     ) -> list[jax.stages.Compiled]:
-        """Returns the programs as `load`, or as `compile` does those that `trace` returns."""
-        return self.load() or self.compile(trace(), devices, options)
+        """Returns the programs as `load`, or as `compile` does those that `trace` returns; the same ones later on."""
+        if self.file is None:
+            return self.compile(trace(), devices, options)
+        if self.file not in _had:
+            _had[self.file] = self.load() or self.compile(trace(), devices, options)
+        return _had[self.file]
 
     def compile(
         self,
@@ -134,6 +131,22 @@ class Place:
         return compiled
 
 
+def named(function: Callable[Given, Returned], name: str | None) -> Callable[Given, Returned]:
+    """Returns a function with the name of its place, if its programs are kept.
+
+    JAX's cache tells programs apart by it; and one that XLA has loaded from there it writes without its functions,
+    so that it could be run and not kept.
+    """
+    if name is None:
+        return function
+
+    def kept(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
+        return function(*args, **kwargs)
+
+    kept.__name__ = name
+    return kept
+
+
 def _load(file: Path, in_tree: Any, out_tree: Any, numbers: Sequence[int]) -> jax.stages.Compiled | None:
     content, devices = read_kept(file), jax.devices()
     if content is None:
@@ -150,7 +163,7 @@ def _compile_and_keep(
 ) -> jax.stages.Compiled:
     hits = _hits_of_thread()
     compiled = traced.compile(options)
-    if _hits_of_thread() == hits:  # see `Place.named`
+    if _hits_of_thread() == hits:  # see `named`
         with contextlib.suppress(Exception):  # such as of a program that calls Python
             write_kept(file, serialize_executable.serialize(compiled)[0])
     return compiled
@@ -203,7 +216,7 @@ class KeptFunction(Generic[Returned]):
         with self._one_at_a_time:
             if told_apart not in self._compiled:
                 place = place_of(self._function.__name__.strip("_"), (self.__module__, self._static, static), given)
-                function = jax.jit(place.named(self._function), static_argnums=self._static)
+                function = jax.jit(named(self._function, place.name), static_argnums=self._static)
                 devices = {device for leaf in jax.tree.leaves(given) for device in getattr(leaf, "devices", set)()}
                 on = sorted(devices, key=lambda device: device.id) or jax.local_devices()[:1]
                 [self._compiled[told_apart]] = place.load_or_compile(lambda: [function.lower(*args)], on)

@@ -158,7 +158,7 @@ def _fly(policy: Any, missions: int, options: dict[str, Any]) -> Tree:
     short = dataclasses.replace(policy.config, env=dataclasses.replace(policy.config.env, max_decisions=2))
     world = load_missions(short, "rooms", missions).env_params
     program = rollouts._Program(short, AgentActor(short), rollouts.Extras(record=True))
-    begin, fly_on, end = rollouts._programs(None, tuple(options.items()))
+    begin, fly_on, end = rollouts._programs(None, None, tuple(options.items()))
     flying = begin(program, world, policy.params, run_streams(0).flights)
     flying, _ = fly_on(program, world, policy.params, flying, rollouts.NO_END)
     return jax.tree.map(_numbers, end(missions, flying))

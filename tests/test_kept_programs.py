@@ -126,6 +126,27 @@ def test_one_text_with_other_arguments_is_another_program(folder: Path) -> None:
     assert len(list(folder.glob("*.executable"))) == len(list(folder.glob("*.program"))) == 3
 
 
+def test_programs_are_loaded_once_in_a_process(folder: Path) -> None:
+    def first(values: jax.Array) -> jax.Array:
+        return values + 1
+
+    first.__name__ = f"first_{time.time_ns()}"  # as above
+    values, traced = jnp.arange(3.0), []
+
+    def trace() -> list[jax.stages.Lowered]:
+        traced.append(None)
+        return [jax.jit(first).lower(values)]
+
+    def found() -> jax.stages.Compiled:
+        [program] = place(arguments=values).load_or_compile(trace, jax.devices()[:1])
+        return program
+
+    program = found()
+    for file in folder.iterdir():
+        file.unlink()
+    assert found() is program and len(traced) == 1 and place(arguments=values).holds_programs()
+
+
 def test_nothing_is_kept_beside_code_of_users(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert place().file is not None
     assert place(made_of=[lambda: None]) == Place(None)

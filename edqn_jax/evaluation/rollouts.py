@@ -19,7 +19,7 @@ from edqn_jax.config import Config
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import decoder
-from edqn_jax.kept_programs import Place, place_of, without_seed
+from edqn_jax.kept_programs import Place, named, place_of, without_seed
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
 from edqn_jax.sim.actions import Discrete
@@ -140,7 +140,7 @@ def fly_missions(
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
     program, missions = _Program(config, actor or AgentActor(config), extras), _count(env_params)
-    begin, fly_on, end = programs or _programs(mesh)
+    begin, fly_on, end = programs or _programs(mesh, None)
     flying = begin(program, env_params, params, key)
     if tell is None or jax.process_count() > 1:
         return end(missions, fly_on(program, env_params, params, flying, NO_END)[0])
@@ -183,7 +183,8 @@ def fly_on_all_devices(
     key = run_streams(seed).flights
     options: Any = {"extras": Extras(record, shuffle_codes, decoder_errors), "mesh": mesh}
     is_agent = actor is None or actor == AgentActor(config)
-    programs = trace_missions(config, env_params, lambda: params, key, **options)() if is_agent else None
+    is_kept = is_agent and _place_of(config, env_params, key, **options).name is not None
+    programs = trace_missions(config, env_params, lambda: params, key, **options)() if is_kept else None
     flights = fly_missions(config, env_params, params, key, actor=actor, tell=tell, programs=programs, **options)
     return jax.tree.map(np.asarray, flights)
 
@@ -204,21 +205,28 @@ def trace_missions(
         mesh: devices.
     """
     program = _Program(config, AgentActor(config), extras)
-    told_apart = without_seed(config), extras, [device.id for device in mesh.devices.flat]
-    place = place_of("flights", told_apart, (env_params, key))
+    place = _place_of(config, env_params, key, extras=extras, mesh=mesh)
     traced = None if place.holds_programs() else _lower(place, program, mesh, env_params, params(), key)
 
     def compile_all() -> Programs:
         trace = lambda: traced or _lower(place, program, mesh, env_params, params(), key)  # noqa: E731
-        return Programs(*map(_without_static, place.load_or_compile(trace, [*mesh.devices.flat])))
+        compiled = place.load_or_compile(trace, [*mesh.devices.flat])
+        # JAX finds what it has compiled again when its functions are called.
+        return _programs(mesh, None) if place.name is None else Programs(*map(_without_static, compiled))
 
     return compile_all
+
+
+def _place_of(config: Config, env_params: EnvParams, key: Array, *, extras: Extras, mesh: Mesh) -> Place:
+    """Returns where the programs are kept that fly the agent."""
+    told_apart = without_seed(config), extras, [device.id for device in mesh.devices.flat]
+    return place_of("flights", told_apart, (env_params, key))
 
 
 def _lower(
     place: Place, program: _Program, mesh: Mesh, env_params: EnvParams, params: Any, key: Array
 ) -> list[jax.stages.Lowered]:
-    begin, fly_on, end = _programs(mesh, named=place.named)
+    begin, fly_on, end = _programs(mesh, place.name)
     first = begin.trace(program, env_params, params, key)
     flying = jax.tree.map(
         lambda leaf, layout: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=layout),
@@ -245,21 +253,19 @@ def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
 
 @functools.cache
 def _programs(
-    mesh: Mesh | None,
-    options: tuple[tuple[str, str | bool], ...] | None = None,
-    named: Callable[[Callable[..., Any]], Callable[..., Any]] = lambda function: function,
+    mesh: Mesh | None, name: str | None, options: tuple[tuple[str, str | bool], ...] | None = None
 ) -> Programs:
     """Returns what flies on the devices of a mesh, compiled with the platform's options, or with others.
 
-    `named` gives functions the names of their programs.
+    `name` is that of the place where they are kept, None where they are not.
     """
     platform = (jax.devices()[0] if mesh is None else mesh.devices.flat[0]).platform
     compiled = partial(jax.jit, compiler_options=compiler_options(platform) if options is None else dict(options))
     # Static by position: an argument passed by name would compile another program.
     return Programs(
-        begin=compiled(named(partial(_begin_all, mesh)), static_argnums=0),
-        fly_on=compiled(named(partial(_fly_on_all, mesh)), static_argnums=0, donate_argnums=3),
-        end=compiled(named(partial(_end_all, mesh)), static_argnums=0),
+        begin=compiled(named(partial(_begin_all, mesh), name), static_argnums=0),
+        fly_on=compiled(named(partial(_fly_on_all, mesh), name), static_argnums=0, donate_argnums=3),
+        end=compiled(named(partial(_end_all, mesh), name), static_argnums=0),
     )
 
 

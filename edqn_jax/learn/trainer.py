@@ -20,7 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
-from edqn_jax.kept_programs import Place, place_of, without_seed
+from edqn_jax.kept_programs import Place, named, place_of, without_seed
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.checked import CheckedChunk
 from edqn_jax.learn.learner import learner_of
@@ -94,7 +94,7 @@ class Trainer:
         keys = [run_streams(number).learning for number in ([seed] if isinstance(seed, int) else seed)]
         arguments = self.env_params, keys[0] if self.agents is None else jnp.stack(keys)
         place = Place(None) if start is not None else self._place_of("first_state", arguments)
-        function = jax.jit(place.named(self._each(begin, 0)))
+        function = jax.jit(named(self._each(begin, 0), place.name))
         [make] = place.load_or_compile(lambda: [function.lower(*arguments)], [*self.mesh.devices.flat])
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
         return jax.jit(lambda state: state, out_shardings=self._layout())(make(*arguments))
@@ -193,7 +193,9 @@ class Trainer:
             check_vma=False,
         )
         assert self._place is not None
-        return jax.jit(self._place.named(run), donate_argnums=1).lower(self.env_params, self.shapes(), self._steps(0))
+        return jax.jit(named(run, self._place.name), donate_argnums=1).lower(
+            self.env_params, self.shapes(), self._steps(0)
+        )
 
     def _steps(self, first: int) -> Array:
         numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)

@@ -19,7 +19,7 @@ from edqn_jax.config import Config
 from edqn_jax.devices.devices import quick_compiler_options
 from edqn_jax.evaluation.decoder import metres_of, predicted_distance
 from edqn_jax.evaluation.trajectories import ATTITUDE, POSITION, VELOCITY, actions_of, columns_of, directions
-from edqn_jax.kept_programs import place_of, without_seed
+from edqn_jax.kept_programs import named, place_of, without_seed
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import fresh_policy
@@ -166,7 +166,7 @@ class FlightRenderer:
 
     def _compiled(self, name: str, program: Any, *arguments: Any) -> Compiled:
         place = place_of(name, (without_seed(self.config), self._decodes), arguments)
-        function, options = jax.jit(place.named(program)), quick_compiler_options(jax.default_backend())
+        function, options = jax.jit(named(program, place.name)), quick_compiler_options(jax.default_backend())
         return place.load_or_compile(lambda: [function.lower(*arguments)], jax.local_devices()[:1], options)[0]
 
 

@@ -62,6 +62,15 @@ def test_straight_up_leaves_the_volume_and_hovering_runs_out_of_time(course):
     assert np.all(still.path_length_m[inside] < 0.05)  # the hover's drift, see docs/drone.md
 
 
+def test_missions_flown_again_are_not_traced_again(course, ahead):
+    traced: list[str] = []
+    jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: traced.append(event))
+    again = fly_on_all_devices(CONFIG, course.env_params, always((1, 0, 0)), record=True)
+    jax.monitoring.clear_event_listeners()
+    assert np.array_equal(again.outcome, ahead.outcome)
+    assert "/jax/core/compile/jaxpr_trace_duration" not in traced
+
+
 def test_nothing_counts_after_the_end(ahead):
     record = ahead.record
     assert record is not None
