@@ -100,15 +100,13 @@ def test_programs_are_told_apart_by_what_they_are_made_of(folder: Path, monkeypa
         place(arguments=(values.astype(jnp.int32), keys)),
         place(arguments=(values, keys["keys"])),
     ]
-    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
-    others.append(place())
-    monkeypatch.undo()
-    monkeypatch.setattr(cache, "_enabled", [folder])
-    monkeypatch.setattr(kept_programs, "digest_of_package", lambda: "of an earlier version")
-    others.append(place())
-    monkeypatch.undo()
-    monkeypatch.setattr(cache, "_enabled", [folder])
-    assert place() == place(arguments=jax.tree.map(jnp.ones_like, (values, keys)) and ARGUMENTS)
+    with monkeypatch.context() as patch:
+        patch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+        others.append(place())
+    with monkeypatch.context() as patch:
+        patch.setattr(kept_programs, "digest_of_package", lambda: "of an earlier version")
+        others.append(place())
+    assert place() == place(arguments=(values + 1, {"keys": jax.random.split(jax.random.key(1), 2)}))
     assert len({each.file for each in [place(), *others]}) == 7
 
 
