@@ -38,6 +38,13 @@ def file(tmp_path: Path) -> Path:
     return mesh_world(tmp_path, GEOMS, **MESHES)
 
 
+@pytest.fixture(params=["c", "jax"])
+def in_c_or_jax(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs a test with rays in C, where there is a compiler, and again with those in JAX."""
+    if request.param == "jax":
+        monkeypatch.setattr(field_rays, "is_available", lambda platform: False)
+
+
 def rays_ahead() -> np.ndarray:
     """Rays [13, 17, 3] along x and around, not as many as go together."""
     across, up = np.meshgrid(np.linspace(-0.6, 0.6, 17), np.linspace(0.4, -0.4, 13))
@@ -176,18 +183,14 @@ def test_the_least_of_blocks_is_never_more_than_a_value_in_them() -> None:
         assert least[place] == block.min()
 
 
-@pytest.mark.parametrize("native", [True, False])
-def test_a_plate_of_a_millimetre_is_seen_from_the_front_and_aslant(
-    native: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("in_c_or_jax")
+def test_a_plate_of_a_millimetre_is_seen_from_the_front_and_aslant(tmp_path: Path) -> None:
     """A ray that only stopped some way within a surface would pass through it: the plate lies on points of its grid."""
     plate = trimesh.creation.box(extents=[0.001, 3, 2])
     stand = trimesh.creation.box(extents=[0.6, 0.3, 0.3]).apply_translation([0, 0, -1.2])
     both: Any = trimesh.util.concatenate([plate, stand])
     geom = '<geom name="plate" type="mesh" mesh="plate" pos="8 5 3"/>'
     file = mesh_world(tmp_path, geom, plate=(np.asarray(both.vertices), np.asarray(both.faces)))
-    if not native:
-        monkeypatch.setattr(field_rays, "is_available", lambda platform: False)
     fields = load_scene(file).others["fields"]
     assert not fields.grids[0].is_convex
     for origin in ([4.0, 5.0, 3.2], [7.0, 2.0, 3.0], [7.3, 3.0, 3.1]):
@@ -198,12 +201,8 @@ def test_a_plate_of_a_millimetre_is_seen_from_the_front_and_aslant(
         np.testing.assert_allclose(np.asarray(depth), 1, atol=0.1)
 
 
-@pytest.mark.parametrize("native", [True, False])
-def test_no_ray_reads_beyond_a_grid_so_long_that_32_bits_round_its_numbers(
-    native: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not native:
-        monkeypatch.setattr(field_rays, "is_available", lambda platform: False)
+@pytest.mark.usefixtures("in_c_or_jax")
+def test_no_ray_reads_beyond_a_grid_so_long_that_32_bits_round_its_numbers() -> None:
     half, nothing = np.array([20100.0, 0.4, 0.4]), (np.zeros((0, 3)), np.zeros((0, 3), np.int64))
     free = Grid.of(np.full((40001, 2, 2), 3.0), 1.0, half, *nothing)
     # What is beyond the first grid is the second.
@@ -214,12 +213,8 @@ def test_no_ray_reads_beyond_a_grid_so_long_that_32_bits_round_its_numbers(
     assert not bool(hit.any())
 
 
-@pytest.mark.parametrize("native", [True, False])
-def test_a_ray_that_comes_near_to_wide_ground_and_leaves_it_meets_nothing(
-    native: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not native:
-        monkeypatch.setattr(field_rays, "is_available", lambda platform: False)
+@pytest.mark.usefixtures("in_c_or_jax")
+def test_a_ray_that_comes_near_to_wide_ground_and_leaves_it_meets_nothing() -> None:
     height = np.broadcast_to(0.1 * (np.arange(41.0) - 20), (641, 5, 41))
     half = np.array([31.0, 0.15, 1.9])
     ground = Grid.of(height, 0.1, half, np.zeros((0, 3)), np.zeros((0, 3), np.int64))
