@@ -64,9 +64,13 @@ def test_straight_up_leaves_the_volume_and_hovering_runs_out_of_time(course):
 
 def test_missions_flown_again_are_not_traced_again(course, ahead):
     traced: list[str] = []
-    jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: traced.append(event))
+
+    def listen(event: str, *_: object, **__: object) -> None:
+        traced.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
     again = fly_on_all_devices(CONFIG, course.env_params, always((1, 0, 0)), record=True)
-    jax.monitoring.clear_event_listeners()
+    jax.monitoring.unregister_event_duration_listener(listen)
     assert np.array_equal(again.outcome, ahead.outcome)
     assert "/jax/core/compile/jaxpr_trace_duration" not in traced
 
