@@ -9,6 +9,8 @@ times the same parts of a trained state, per decision and with their minimum tim
 
 from __future__ import annotations
 
+from measurement.command import in_a_sentence
+
 import dataclasses
 import os
 
@@ -56,5 +58,12 @@ def test_part(name: str, now: Moment, benchmark: BenchmarkFixture) -> None:
     assert benchmark(part.seconds, STEPS) > 0
 
 
+@in_a_sentence
+def main() -> int:
+    """Prints how pytest runs this file."""
+    print(__doc__)
+    return 0
+
+
 if __name__ == "__main__":
-    print(__doc__)  # pytest runs it
+    main()

@@ -22,6 +22,8 @@ second -- are for B alone, so that a commit shows what options cost.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import contextlib
 import json
@@ -37,7 +39,6 @@ from typing import Any
 from edqn_jax.errors import ConfigError
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import parse_config, split
 from measurement.intervals import median_interval
 from measurement.parts import PARTS

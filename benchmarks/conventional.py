@@ -14,6 +14,8 @@ Arguments after -- are options of train.py.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import statistics
 import sys
@@ -32,7 +34,6 @@ from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.conditions import Watch, conditions, sentence
 from measurement.flags import parse_config, split
 from measurement.whole import WholeStep, steady

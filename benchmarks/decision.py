@@ -11,6 +11,8 @@ Arguments after -- are options of train.py. Parameters are untrained, which does
 
 from __future__ import annotations
 
+from measurement.command import Parser, in_a_sentence
+
 import argparse
 import statistics
 import sys
@@ -25,7 +27,6 @@ from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
-from measurement.command import Parser, in_a_sentence
 from measurement.cores import keep_to, own_cores
 from measurement.flags import parse_config, split
 

@@ -9,6 +9,8 @@ command. Packets are those of a simulated flight, at the resolution of a camera.
 
 from __future__ import annotations
 
+from measurement.command import Parser, in_a_sentence
+
 import argparse
 import statistics
 import sys
@@ -33,7 +35,6 @@ from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
-from measurement.command import Parser, in_a_sentence
 from measurement.cores import keep_to, own_cores
 
 REPEATS, CALLS = 5, 2000

@@ -8,6 +8,8 @@ of the last four decisions, for a sensor that begins anew in each (as that of th
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -30,7 +32,6 @@ from edqn_jax.sim.sensors.event_field import EventField
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.recorded import fly_recorded
 
 NAMES = {

@@ -12,6 +12,8 @@ and lets the vehicle stop: what also collides then, no hover would have avoided.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import dataclasses
 import sys
@@ -30,7 +32,6 @@ from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 
 ENDS: dict[str, tuple[tuple[str, ...], str]] = {
     **{str(fault): ((str(fault),), Action.HOLD) for fault in Fault},

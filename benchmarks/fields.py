@@ -11,6 +11,8 @@ nearest point of the file's own triangles.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import sys
 from collections.abc import Sequence
@@ -33,7 +35,6 @@ from edqn_jax.sim.scene.mesh_field import MARGIN_M
 from edqn_jax.sim.scene.mjcf import compile_model, load_world, resolve_world
 from edqn_jax.sim.scene.scene import Scene
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 
 CONFIG = CameraConfig(width=32, height=24)
 ROOM_M = 0.5

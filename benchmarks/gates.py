@@ -12,6 +12,8 @@ Arguments after -- are options of train.py. The interval is Wilson's, 95 %.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -34,7 +36,6 @@ from edqn_jax.sim.task.env import EnvParams, EnvState
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import parse_options, split, with_test_worlds_only
 
 

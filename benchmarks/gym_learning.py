@@ -12,6 +12,8 @@ blind. Intervals are a bootstrap over seeds and missions, Wilson's for one seed.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import time
 from collections.abc import Sequence
@@ -27,7 +29,6 @@ from edqn_jax.extras import require_extra
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 
 NAME = "EDQN/Random-v0"
 OBSERVATIONS = ("code", "kinematics")

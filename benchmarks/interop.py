@@ -10,6 +10,8 @@ Arguments after -- are options of train.py. Needs `pip install 'edqn-jax[gym]'`.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import statistics
 import time
@@ -28,7 +30,6 @@ from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import parse_config, split
 
 DRONES = 256

@@ -16,6 +16,8 @@ Intervals are a bootstrap over seeds and missions, 95 %.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import functools
 import sys
@@ -32,7 +34,6 @@ from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.files import check_can_make
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import split
 
 REAL = ("--exposure.real",)

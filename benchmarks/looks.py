@@ -11,6 +11,8 @@ dashes there.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import sys
 from collections.abc import Callable, Sequence
@@ -23,7 +25,6 @@ from edqn_jax.config.simulation import LOOKS
 from edqn_jax.evaluation.evaluate import evaluate_look
 from edqn_jax.runs.policies import load_policy
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 
 HEAD = (
     "| surface.pattern | reached the goal | collisions | error, median | 90th percentile | frames |\n"

@@ -15,6 +15,8 @@ With --figure one mission is flown and drawn, as a PNG of six moments or as a GI
 
 from __future__ import annotations
 
+from measurement.command import Parser, in_a_sentence
+
 import argparse
 import dataclasses
 import sys
@@ -50,7 +52,6 @@ from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.worlds import families
 from measurement import json_report
-from measurement.command import Parser, in_a_sentence
 from measurement.intervals import difference_interval
 from rivals.mapping import grid
 from rivals.mapping.grid import MapConfig

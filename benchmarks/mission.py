@@ -15,6 +15,8 @@ Arguments after -- are options of train.py.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import hashlib
 import json
@@ -34,7 +36,6 @@ from edqn_jax.devices.hardware import describe_processor
 from edqn_jax.evaluation.metrics import wilson_interval
 from edqn_jax.files import write_atomically
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import split
 
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"

@@ -16,6 +16,8 @@ in memory, about 15 GB. --quick is one seed of E-DQN and the blind agent on the 
 
 from __future__ import annotations
 
+from measurement.command import Parser, in_a_sentence
+
 import argparse
 import contextlib
 import dataclasses
@@ -36,7 +38,6 @@ from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
-from measurement.command import Parser, in_a_sentence
 from measurement.flags import parse_config as for_timing
 from measurement.flags import parse_options, split, with_test_worlds_only
 from measurement.whole import steady

@@ -19,6 +19,8 @@ rollout on as many threads. Rows are printed and written as they end, each after
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import dataclasses
 import itertools
@@ -48,7 +50,6 @@ from edqn_jax.runs.directory import to_plain_json
 from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.ceilings import Rollout
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import parse_config, split
 from measurement.whole import WholeStep, steady
 

@@ -12,6 +12,8 @@ worlds.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import dataclasses
 import sys
@@ -41,7 +43,6 @@ from edqn_jax.sim.task.observation import Observation, motion_size, own_size
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.cores import keep_to, own_cores
 from measurement.intervals import median_interval
 

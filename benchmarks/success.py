@@ -20,6 +20,8 @@ leaves it out.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import contextlib
 import dataclasses
@@ -54,7 +56,6 @@ from edqn_jax.runs.policies import load_policy, save_policy
 from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.training.loop import train_seeds
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import parse_options, split, with_test_worlds_only
 from rivals.learners import flight_columns
 from rivals.planning import judged_scenes, shortest_lengths

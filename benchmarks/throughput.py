@@ -13,6 +13,8 @@ Arguments after -- are options of train.py.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import statistics
 import sys
@@ -32,7 +34,6 @@ from edqn_jax.learn.trainer import AXIS
 from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.ceilings import Rollout, ceilings
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.conditions import Watch, conditions
 from measurement.flags import parse_config, split
 from measurement.parts import parts_of

@@ -8,6 +8,8 @@ training uses. Prints a Markdown table.
 
 from __future__ import annotations
 
+from measurement.command import Parser, in_a_sentence
+
 import itertools
 import platform
 import sys
@@ -24,7 +26,6 @@ from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.drone import DroneState, Flight, hover_state, yaw_of
 from edqn_jax.sim.physics.flight import fly_decision
 from measurement import json_report
-from measurement.command import Parser, in_a_sentence
 
 Decide = Callable[[DroneState, jax.Array, jax.Array], tuple[DroneState, Flight]]
 

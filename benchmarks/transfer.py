@@ -30,6 +30,8 @@ except ConfigError as error:
     print(error, file=sys.stderr)
     sys.exit(2)
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import jax
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +49,6 @@ from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.task.observation import MAX_YAW_RATE, knows_contrast
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 from outer import flights
 
 

@@ -14,6 +14,8 @@ Needs `pip install 'edqn-jax[bench]'` and OpenGL without a display (MUJOCO_GL=eg
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import os
 import statistics
@@ -35,7 +37,6 @@ from edqn_jax.extras import require_extra
 from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from measurement import json_report
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import parse_config, split
 from measurement.whole import WholeStep, steady
 

@@ -9,6 +9,8 @@ contact for any other outcome. The exit code is 1 if one outcome differs.
 
 from __future__ import annotations
 
+from measurement.command import Parser, in_a_sentence
+
 import platform
 import sys
 from collections.abc import Sequence
@@ -21,7 +23,6 @@ import numpy as np
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement, check_verdicts
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
-from measurement.command import Parser, in_a_sentence
 from measurement.recorded import fly_recorded
 
 

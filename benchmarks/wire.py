@@ -11,6 +11,8 @@ Latency: from when the camera knew of its newest event, on the same clock, to wh
 
 from __future__ import annotations
 
+from measurement.command import Parser, in_a_sentence
+
 import argparse
 import contextlib
 import dataclasses
@@ -50,7 +52,6 @@ from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.environment import make
 from measurement import json_report
-from measurement.command import Parser, in_a_sentence
 from measurement.cores import keep_to, own_cores
 
 WORLD = "medium"

@@ -27,6 +27,8 @@ over seeds and missions, 95 %, differences are of the same missions.
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import argparse
 import functools
 import json
@@ -39,7 +41,6 @@ import success
 from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
 from edqn_jax.devices.hardware import count_cores
 from edqn_jax.files import check_can_make
-from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import split
 from worth_parts import own, traffic
 from worth_parts.axes import AXES, config_of, places_of

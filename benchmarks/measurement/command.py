@@ -1,12 +1,16 @@
-"""What the commands of all benchmarks share: help, `--json`, a clock, and a sentence and code 2 for invalid input."""
+"""What the commands of all benchmarks share: help, `--json`, a clock, and a sentence and code 2 for invalid input.
+
+A benchmark imports this module before any other: JAX and the rest take seconds, and the clock begins here.
+"""
 
 from __future__ import annotations
 
 import argparse
+import atexit
 import contextlib
 import functools
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from edqn_jax.cli.process.status import status_of
@@ -74,13 +78,13 @@ def at_least_one(text: str) -> int:
 def in_a_sentence(main: Callable[..., int]) -> Callable[..., int]:
     """Returns a `main` that prints what is wrong with its input, or which package is missing, and returns 2.
 
-    While it measures, standard error has a line with a clock, as those of `edqn` have.
+    The clock of this process, if it runs a benchmark, ends with it.
     """
 
     @functools.wraps(main)
     def command(*arguments: object) -> int:
         try:
-            with shown_clock():
+            with _clock.pop_all():
                 return main(*arguments)
         except (ConfigError, MissingPackageError) as error:
             print(error, file=sys.stderr)
@@ -89,11 +93,18 @@ def in_a_sentence(main: Callable[..., int]) -> Callable[..., int]:
     return command
 
 
-@contextlib.contextmanager
-def shown_clock() -> Iterator[None]:
-    """Shows within the block the name of this program and the time that it takes, unless it is asked for its help."""
-    if {"-h", "--help"} & set(sys.argv[1:]):
-        yield
-        return
-    with lasting_streams() as outputs, status_of(Path(sys.argv[0]).stem, outputs):
-        yield
+def _show_clock(program: Path) -> contextlib.ExitStack:
+    """Shows the name of a program and the time that it takes, as `edqn` does, until what is returned is closed."""
+    with contextlib.ExitStack() as shown:
+        shown.enter_context(status_of(program.stem, shown.enter_context(lasting_streams())))
+        return shown.pop_all()
+
+
+def _is_benchmark(program: Path) -> bool:
+    """Returns whether a file is one of `benchmarks/`."""
+    return program.resolve().parent == Path(__file__).resolve().parents[1]
+
+
+_program = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+_clock = _show_clock(_program) if _is_benchmark(_program) else contextlib.ExitStack()
+atexit.register(_clock.close)  # of a benchmark that ends without `main`, such as for want of a package

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from measurement.command import Parser, at_least_one, in_a_sentence
+
 import os
 import re
 import subprocess
@@ -12,7 +14,6 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.extras import MissingPackageError
-from measurement.command import Parser, at_least_one, in_a_sentence
 from tests.support.processes import PATIENCE_S, ROOT
 
 
@@ -56,23 +57,15 @@ def test_the_help_says_what_is_timed(capsys: pytest.CaptureFixture[str]) -> None
     assert "write the report to this file" in said
 
 
-MEASURES = """
-import sys
-from measurement.command import in_a_sentence
+def test_a_benchmark_has_a_clock_on_standard_error_before_it_imports_what_takes_long() -> None:
+    environ = {**os.environ, "PYTHONPATH": str(ROOT)}
+    program = [sys.executable, "-X", "importtime", ROOT / "benchmarks" / "verdicts.py", "--help"]
+    ended = subprocess.run(program, capture_output=True, text=True, env=environ, timeout=PATIENCE_S)
+    assert ended.returncode == 0 and ended.stdout.startswith("usage: python benchmarks/verdicts.py")
+    before, clock, after = ended.stderr.partition("verdicts: starting, 0:0")
+    imported = re.compile(r"\| +jax$", re.MULTILINE)
+    assert clock and imported.search(after) and not imported.search(before)
 
 
-@in_a_sentence
-def main() -> int:
-    print("measured")
-    return 3
-
-sys.exit(main())
-"""
-
-
-@pytest.mark.parametrize(("words", "said"), [((), r"-c: starting, 0:0\d\n( .*\n)*"), (("--help",), "")])
-def test_a_benchmark_has_a_clock_on_standard_error(words: tuple[str, ...], said: str) -> None:
-    environ = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'benchmarks'}"}
-    started = [sys.executable, "-c", MEASURES, *words]
-    ended = subprocess.run(started, capture_output=True, text=True, env=environ, timeout=PATIENCE_S)
-    assert (ended.returncode, ended.stdout) == (3, "measured\n") and re.fullmatch(said, ended.stderr)
+def test_what_is_no_benchmark_has_no_clock(capfd: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 17 and capfd.readouterr() == ("", "")
