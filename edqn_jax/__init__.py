@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from edqn_jax.xla_flags import disable_ynn_fusions
 
 if TYPE_CHECKING:
+    from edqn_jax.cli.process.status import show_phases
     from edqn_jax.config import (
         ACTION_SETS,
         AIRFRAMES,
@@ -79,6 +80,7 @@ _MODULES = {
     "plan": "planning.astar",
     "record": "interop.flight_files",
     "save_policy": "runs.policies",
+    "show_phases": "cli.process.status",
     "train": "training.loop",
     "train_seeds": "training.loop",
     "use_cpu_devices": "devices.devices",
@@ -122,6 +124,7 @@ __all__ = [
     "plan",
     "record",
     "save_policy",
+    "show_phases",
     "train",
     "train_seeds",
     "use_cpu_devices",

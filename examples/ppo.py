@@ -9,6 +9,11 @@ Prints mean return and success of the greedy policy before and after training, i
 
 from __future__ import annotations
 
+import edqn_jax
+
+# Before the imports below, which take seconds.
+show_phase = edqn_jax.show_phases("ppo") if __name__ == "__main__" else lambda *_: None
+
 import dataclasses
 import time
 from typing import Any, Literal, NamedTuple
@@ -20,7 +25,6 @@ import optax
 import tyro
 from jax import Array
 
-import edqn_jax
 from edqn_jax.interop import functional
 
 Space = functional.Discrete | functional.Box
@@ -223,6 +227,7 @@ def fly(env: functional.FunctionalEnv, task: functional.Params, params: Any, mis
 
 def main(settings: Settings) -> None:
     """Trains and prints."""
+    show_phase("preparing the worlds")
     options: dict[str, Any] = {"observation": settings.observation}
     if settings.observation == "code":
         policy = edqn_jax.load_policy("pretrained")
@@ -238,22 +243,29 @@ def main(settings: Settings) -> None:
         unseen = task
     missions = jnp.arange(unseen.world.missions.scene.shape[0])
 
-    @jax.jit
     def test(params: Any) -> tuple[Array, Array]:
         returns, success = jax.vmap(lambda mission: fly(env, unseen, params, mission))(missions)
         return returns.mean(), success.mean()
 
     init, update = make_train(settings, env, task)
+    show_phase("starting the environments")
     carry = init(jax.random.key(settings.seed))
-    before, began = test(carry[0]), time.perf_counter()
+    show_phase("compiling the test flights")
+    fly_tests = jax.jit(test).lower(carry[0]).compile()
+    show_phase("flying the tests")
+    before, began = jax.block_until_ready(fly_tests(carry[0])), time.perf_counter()
+    show_phase("compiling the training")
+    update = update.lower(carry).compile()
     batch = settings.num_envs * settings.num_steps
     updates = -(-settings.decisions // batch)
     for number in range(1, updates + 1):
-        carry, figures = update(carry)
+        show_phase("training", number - 1, updates)
+        carry, figures = jax.block_until_ready(update(carry))
         if number % max(1, updates // 10) == 0:
             seen = f"return {float(figures['return']):7.1f}, success {float(figures['success']):.0%}"
             print(f"{number * batch:>10,} decisions, {time.perf_counter() - began:4.0f} s: {seen}", flush=True)
-    for name, (mean, success) in (("untrained", before), ("trained", test(carry[0]))):
+    show_phase("flying the tests")
+    for name, (mean, success) in (("untrained", before), ("trained", fly_tests(carry[0]))):
         print(f"{name}: mean return {float(mean):.1f}, success {float(success):.1%} of {len(missions)} missions")
 
 

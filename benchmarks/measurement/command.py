@@ -13,8 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from edqn_jax.cli.process.status import status_of
-from edqn_jax.cli.process.streams import lasting_streams
+from edqn_jax.cli.process.status import open_status
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.files import check_can_write
@@ -93,18 +92,11 @@ def in_a_sentence(main: Callable[..., int]) -> Callable[..., int]:
     return command
 
 
-def _show_clock(program: Path) -> contextlib.ExitStack:
-    """Shows the name of a program and the time that it takes, as `edqn` does, until what is returned is closed."""
-    with contextlib.ExitStack() as shown:
-        shown.enter_context(status_of(program.stem, shown.enter_context(lasting_streams())))
-        return shown.pop_all()
-
-
 def _is_benchmark(program: Path) -> bool:
     """Returns whether a file is one of `benchmarks/`."""
     return program.resolve().parent == Path(__file__).resolve().parents[1]
 
 
 _program = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
-_clock = _show_clock(_program) if _is_benchmark(_program) else contextlib.ExitStack()
+_clock = open_status(_program.stem) if _is_benchmark(_program) else contextlib.ExitStack()
 atexit.register(_clock.close)  # of a benchmark that ends without `main`, such as for want of a package

@@ -142,3 +142,24 @@ def test_outside_of_a_command_nothing_is_shown(capsys: pytest.CaptureFixture[str
     assert capsys.readouterr() == ("", "")
     say_phase("flying 3 missions")
     assert capsys.readouterr() == ("flying 3 missions\n", "")
+
+
+SCRIPT = """
+import edqn_jax
+show_phase = edqn_jax.show_phases("mine")
+import sys
+print("heavy" if {"jax", "numpy"} & set(sys.modules) else "light", flush=True)
+show_phase("learning", 1, 4)
+sys.stdin.readline()
+print("learnt")
+"""
+
+
+def test_a_script_shows_its_phases_until_it_ends() -> None:
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", SCRIPT], cwd=ROOT, stdin=pipe, stdout=pipe, stderr=pipe) as script:
+        assert script.stderr is not None
+        said = read_until(script.stderr.fileno(), b"left\n")
+        ended = script.communicate(b"go on\n", timeout=PATIENCE_S)
+    assert re.match(rb"mine: starting, 0:0\d\n(.*\n)*mine: learning, 1 of 4, 0:0\d, about 0:\d\d left\n", said)
+    assert (ended[0], script.returncode) == (b"light\nlearnt\n", 0)

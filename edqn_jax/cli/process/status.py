@@ -7,6 +7,7 @@ command's name and its clock where a phase is named for the first time, and shor
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import shutil
@@ -14,9 +15,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
 
 from edqn_jax.cli.process.durations import Durations
-from edqn_jax.cli.process.streams import Lasting
+from edqn_jax.cli.process.streams import Lasting, lasting_streams
+
+if TYPE_CHECKING:
+    from edqn_jax.evaluation.rollouts import ShowPhase
 
 BEGAN = time.monotonic()
 """When this process began, about."""
@@ -203,6 +208,31 @@ def status_of(title: str, outputs: Sequence[Lasting]) -> Iterator[None]:
         end_status()
         _timed.remove(durations)
         durations.keep()
+
+
+def show_phases(title: str) -> ShowPhase:
+    """Shows on standard error what a script does, from now until it ends, as the commands of `edqn` do.
+
+    A terminal has one line with the phase and its clock; elsewhere, as in a log, a line is printed after every two
+    seconds without output. Nothing is shown where standard error is another program's, as in a notebook. Call it before
+    the imports that take seconds.
+
+    Args:
+        title: what each line begins with, such as the name of the script.
+
+    Returns:
+        what to call as a phase begins: with its name, and where it has parts with how many are done, of how many. It is
+        also a `phase` for `evaluate` and `record`.
+    """
+    atexit.register(open_status(title).close)
+    return show_phase
+
+
+def open_status(title: str) -> contextlib.ExitStack:
+    """Shows what this process does, as `status_of`, until what is returned is closed."""
+    with contextlib.ExitStack() as shown:
+        shown.enter_context(status_of(title, shown.enter_context(lasting_streams())))
+        return shown.pop_all()
 
 
 def _standard_error(outputs: Sequence[Lasting]) -> Lasting | None:
