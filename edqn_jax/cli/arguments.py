@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import tyro
 
@@ -15,6 +15,11 @@ from edqn_jax.cli.process.parsing import parse_or_say
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.policies import function_named, no_run, policy_folder
+
+if TYPE_CHECKING:
+    from edqn_jax.evaluation.missions import MissionSet
+    from edqn_jax.learn.policy import Policy
+    from edqn_jax.policies.functions import FunctionPolicy
 
 Point = tuple[float, float, float]
 
@@ -157,15 +162,20 @@ def check_run(folder: Path) -> None:
         raise no_run(folder)
 
 
-def print_notes(run: Path, world: str | None, note: str | None) -> None:
-    """Prints what differs from what a flight would have been: worlds of the run that changed, and a note on missions.
+def print_notes(policy: Policy | FunctionPolicy, run: Path, world: str | None, missions: MissionSet) -> None:
+    """Prints, before a flight, what differs from what it would have been, and what the policy was not trained for.
 
     Args:
+        policy: that is to fly.
         run: as it was named.
         world: that was asked for; None is the run's own.
-        note: on the missions, or None.
+        missions: to be flown.
     """
+    from edqn_jax.evaluation.world_check import warn_of_missions
+    from edqn_jax.policies.functions import config_of
     from edqn_jax.runs.policies import worlds_replaced
 
-    for each in (*(worlds_replaced(run) if world is None else ()), *(() if note is None else (note,))):
-        print(each)
+    replaced = worlds_replaced(run) if world is None else ()
+    notes = () if missions.note is None else (missions.note,)
+    for each in (*replaced, *notes, *warn_of_missions(config_of(policy), missions)):
+        print(each, flush=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -97,7 +98,6 @@ def evaluate_command(args: EvaluateArgs) -> None:
     from edqn_jax.evaluation.evaluate import evaluate
     from edqn_jax.evaluation.latency import decision_latency_ms
     from edqn_jax.evaluation.trajectories import write_trajectories
-    from edqn_jax.evaluation.world_check import warn_of_missions
     from edqn_jax.policies.functions import actor_of, config_of
     from edqn_jax.runs.directory import to_plain_json
     from edqn_jax.runs.policies import find_policy
@@ -121,6 +121,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
         decoder=args.decoder,
         conditions=args.conditions,
         phase=show_phase,
+        announce=partial(print_notes, policy, args.run, args.world),
     )
     config = config_of(policy)
     show_phase("measuring the latency")
@@ -135,9 +136,6 @@ def evaluate_command(args: EvaluateArgs) -> None:
         **evaluation.figures,
         "decision_latency_ms": decision_latency_ms(config, policy.params, actor=actor_of(policy, config)),
     }
-    print_notes(args.run, args.world, evaluation.missions.note)
-    for warning in warn_of_missions(config, evaluation.missions):
-        print(warning)
     Console().print(figures_table(figures))
     if args.json is not None:
         write_atomically(args.json, json.dumps(to_plain_json(figures), indent=2, allow_nan=False) + "\n")

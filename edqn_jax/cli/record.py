@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -71,9 +72,7 @@ def record_command(args: RecordArgs) -> None:
     """
     show_phase("loading the policy")
 
-    from edqn_jax.evaluation.world_check import warn_of_missions
     from edqn_jax.interop.flight_files import record
-    from edqn_jax.policies.functions import config_of
     from edqn_jax.report.style import OUTCOME_LABELS
     from edqn_jax.runs.policies import find_policy
 
@@ -88,10 +87,8 @@ def record_command(args: RecordArgs) -> None:
         size=args.size,
         pace=(args.speed, args.fps),
         phase=show_phase,
+        announce=partial(print_notes, policy, args.run, args.world),
     )
-    print_notes(args.run, args.world, done.missions.note)
-    for warning in warn_of_missions(config_of(policy), done.missions):
-        print(warning)
     print(
         f"{OUTCOME_LABELS[done.outcome]} after {done.seconds:.1f} s; '{args.file}' has "
         f"{args.file.stat().st_size / 1e6:.1f} MB",

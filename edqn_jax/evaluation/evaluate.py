@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,7 @@ def evaluate(
     decoder: bool = False,
     conditions: Layer | None = None,
     phase: ShowPhase | None = None,
+    announce: Callable[[MissionSet], None] = lambda _: None,
 ) -> Evaluation:
     """Flies a policy greedily, every mission once, and measures.
 
@@ -95,6 +97,7 @@ def evaluate(
             `{"air": {"gusts_m_s": 5.0}}`; see `config.CONDITIONS`.
         phase: called with the name of each phase as it begins, such as `compiling`, and while it flies with how many
             missions have ended, of how many.
+        announce: called with the missions before they are flown; their `note` says what the policy never met.
 
     Raises:
         ConfigError: if there is no such world or condition, the missions cannot be flown, the policy cannot fly, or
@@ -110,7 +113,9 @@ def evaluate(
         check_predicts_distance(config, actor)
     show = phase or show_nothing
     show("preparing worlds")
-    mission_set = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
+    loaded = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
+    mission_set = note_unseen(policy, config, loaded)
+    announce(mission_set)
     flights = fly_on_all_devices(
         config,
         mission_set.env_params,
@@ -124,7 +129,7 @@ def evaluate(
     )
     show("shortest paths")
     shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
-    return Evaluation(note_unseen(policy, config, mission_set), flights, _figures(config, flights, shortest))
+    return Evaluation(mission_set, flights, _figures(config, flights, shortest))
 
 
 def evaluate_look(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -48,6 +49,7 @@ def record(
     size: tuple[int, int] | None = None,
     pace: tuple[float | None, float | None] = (None, None),
     phase: ShowPhase = show_nothing,
+    announce: Callable[[MissionSet], None] = lambda _: None,
 ) -> Recorded:
     """Flies a policy once and writes the flight, in place of a file of that name.
 
@@ -63,6 +65,7 @@ def record(
         pace: of a video: how many times as fast as flown it is (None: a frame a decision, or fewer), and its frames a
             second (None: 10).
         phase: called as each phase begins, and after each frame that is drawn.
+        announce: called with the mission before it is flown; its `note` says what the policy never met.
 
     Raises:
         ConfigError: if the policy cannot fly there, or the file cannot be written or has another ending.
@@ -79,14 +82,16 @@ def record(
     # Of several drones the whole group is flown, and the first one's flight is shown.
     own = config.world.name if group.is_multi_drone(config) else config.world.flown or config.world.name
     phase("preparing the world")
-    missions = load_missions(config, str(world or own), config.env.drones, seed, start, goal)
+    loaded = load_missions(config, str(world or own), config.env.drones, seed, start, goal)
+    missions = note_unseen(policy, config, loaded)
+    announce(missions)
     if suffix in VIDEO:
         given = {"size": size, "speed": pace[0], "fps": pace[1]}
         film = {name: value for name, value in given.items() if value is not None}
         flights = _write_video(file, policy, config, missions, seed, phase, **film)
     else:
         flights = _write_events(file, policy, config, missions, seed, size, phase)
-    return Recorded(_ending(flights), float(flights.flight_seconds[0]), note_unseen(policy, config, missions))
+    return Recorded(_ending(flights), float(flights.flight_seconds[0]), missions)
 
 
 def _write_video(

@@ -181,3 +181,16 @@ def test_predicted_distance_stands_beside_the_true_one():
     assert len(rows) > 10_000 and rows.min() > 360 and columns.min() > 200 and columns.max() < 405
     plain = np.asarray(recorded(Drawn(), 1).convert("RGB"), int)
     assert np.abs(plain - good)[360:, 210:].max() > 100
+
+
+def test_what_the_policy_was_not_trained_for_is_said_before_the_flight(run, tmp_path, monkeypatch, capsys):
+    world, scene = tmp_path / "box.xml", world_with_a_box()
+    write_scene(dataclasses.replace(scene, volume=scene.volume * np.array([1, 1, 9.0], np.float32)), world)
+
+    def fly(*_, **__):
+        raise ConfigError("not flown")
+
+    monkeypatch.setattr(flight_files, "_fly_missions", fly)
+    with pytest.raises(ConfigError, match="not flown"):
+        record.record_command(record.RecordArgs(run, tmp_path / "flight.gif", world=str(world)))
+    assert "is much larger than those that the policy was trained in" in capsys.readouterr().out
