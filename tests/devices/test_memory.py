@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import pytest
 
 from edqn_jax.cli import commands, main
-from edqn_jax.config.loading import make_config
 from edqn_jax.devices import memory
 from edqn_jax.devices.memory import GIB, bytes_of, check_fits, host_bytes, memory_error, memory_of
 from edqn_jax.errors import ConfigError
 from edqn_jax.training import setup
+from tests.support.configs import TINY_RUN
 
 
 def card(limit: float, in_use: float = 0.0) -> Any:
@@ -62,12 +62,12 @@ def test_a_machine_has_what_its_container_may_use(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_training_is_refused_before_it_is_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "memory_of", lambda device: (GIB // 1024, GIB // 1024))
+    monkeypatch.setattr(memory, "memory_of", lambda device: (GIB // 2**18, GIB // 2**18))
     monkeypatch.setattr(setup.Trainer, "compile", lambda trainer: pytest.fail("it was compiled"))
     monkeypatch.setattr(setup.Trainer, "trace", lambda trainer: pytest.fail("it was traced"))
     with (
         pytest.raises(ConfigError, match="the train state takes .* GiB of memory, but this machine has 0.00 GiB"),
-        setup.set_up_training(make_config("paper")),
+        setup.set_up_training(TINY_RUN),
     ):
         pass
 

@@ -64,6 +64,7 @@ def test_a_validation_is_due_where_a_multiple_is_crossed_once_there_was_learning
 
 @pytest.mark.slow
 def test_half_of_the_validation_begins_near_the_start_and_all_of_it_in_random_worlds() -> None:
-    own, random = Config(), Config(world=WorldConfig(name="sparse", pool_size=2, missions=8))
+    few = TrainConfig(validation_missions=16)
+    own, random = Config(train=few), Config(train=few, world=WorldConfig(name="sparse", pool_size=2, missions=8))
     assert run_missions(own).near_start.sum() == own.train.validation_missions // 2
     assert run_missions(random).near_start.all()
