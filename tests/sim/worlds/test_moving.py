@@ -26,7 +26,7 @@ from edqn_jax.sim.worlds.moving import MOVING_SHARE, Moving
 from tests.support.meshes import bracket
 from tests.support.registries import keep_as_they_are
 
-WORLDS = 12
+WORLDS = 8
 KEYS = world_keys("validation", WORLDS)
 RADIUS = 0.36
 KINDS = ("boxes", "cylinders", "spheres")
@@ -67,7 +67,7 @@ def test_half_of_the_obstacles_move_in_the_worlds_moving_and_the_option_says_how
         apart = [np.linalg.norm(x["boxes"][1] - x["boxes"][0], axis=-1) for x in at]
         present = np.concatenate([np.asarray(x["boxes"][0])[:, 0] < PARKED / 2 for x in at])
         shares[name] = (np.concatenate(apart) > 1e-3)[present].mean()
-    # 260 blocks: a standard deviation of 0.03; some stand since they would come near the start or the goal.
+    # 170 blocks: a standard deviation of 0.04; some stand since they would come near the start or the goal.
     assert abs(shares["moving"] - MOVING_SHARE) < 0.12 and abs(shares["everything"] - 0.7) < 0.12
 
 
