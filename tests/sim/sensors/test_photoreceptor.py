@@ -126,7 +126,7 @@ def test_the_lag_of_an_episode_is_that_of_one_filter_over_all_of_it(law, lux):
     level = (
         events.airsim_log_brightness(frames) if law is AIRSIM else events.log_brightness(config, frames)
     ).__array__()
-    shown = photoreceptor_plain.follow(30.0 * lux / 10.0, level, times, frames, np.zeros(level.shape[1:]), parts=2000)
+    shown = photoreceptor_plain.follow(30.0 * lux / 10.0, level, times, frames, np.zeros(level.shape[1:]), parts=400)
     changes = []
     for k in range(6):
         field, memory = run(config, memory, jnp.asarray(frames[3 * k : 3 * k + 3]), gap_s=GAP)
@@ -173,8 +173,8 @@ def test_the_lag_of_a_stream_is_carried_from_window_to_window():
 
 
 def test_what_esim_shows_is_the_photoreceptor_within_one_threshold():
-    config, frames = dataclasses.replace(ESIM, **SLOW), long_flight(3, 100)
-    times = np.array([0.02 * k for k in range(100)])
+    config, frames = dataclasses.replace(ESIM, **SLOW), long_flight(3, 50)
+    times = np.array([0.02 * k for k in range(50)])
     memory = memory_of(config, 11)
     field, _ = run(config, memory, jnp.asarray(frames), tuple(times), True)
     level = levels(config, frames).astype(np.float64)
