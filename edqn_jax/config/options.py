@@ -50,6 +50,7 @@ class Config:
 
 
 CONDITIONS: dict[str, tuple[str, ...]] = {
+    "camera": ("shadows",),
     "env": ("action_delay", "delay_share", "setpoint_m_s2", "setpoint_share", "drones"),
     "events": (
         *("profile", "threshold", "tolerance", "contrast_on", "contrast_off", "refractory_ns", "bandwidth_hz"),

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim.camera import columns, coverage, native, raycast
+from edqn_jax.sim.camera import columns, coverage, native, raycast, shadows
 from edqn_jax.sim.camera.columns import Frame
 from edqn_jax.sim.camera.coverage import Layers
 from edqn_jax.sim.camera.depth import nearest_depth
@@ -44,6 +44,17 @@ def _factor(
     if frame.surfaces is None or shape is None:
         return texture_factor(config, frame.origin, rays, depth, *slopes)
     return albedo_factor(frame.surfaces, shape, rays, depth, *slopes)
+
+
+def _with_shadows(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Layers:
+    """Returns the layers with the shadows that are cast on them: there, `Layer.value` is that of the ambient light."""
+    light = raycast.daylight_of(config, frame.scene.daylight)
+    joined: coverage.Layer = jax.tree.map(lambda *parts: jnp.stack(parts), *layers)
+    depth = jnp.where(joined.closeness > 0, safe_inverse(joined.closeness), 0.0)
+    dark = shadows.in_shadow(frame.scene, light, frame.value, frame.origin, rays, depth, joined.shape)
+    ambient = joined.coverage * shadows.ambient_of(light, frame.value, joined.shape)
+    values = jnp.where(dark, ambient, joined.value)
+    return tuple(dataclasses.replace(layer, value=value) for layer, value in zip(layers, values, strict=True))
 
 
 def _backdrop(config: CameraConfig, frame: Frame, rays: Rays) -> Array:
@@ -74,6 +85,9 @@ def _backdrop(config: CameraConfig, frame: Frame, rays: Rays) -> Array:
         shown = jnp.where(seen, raycast.lambert_shade(light, *normal) * value["planes"][n], shown)
         slopes = jnp.where(seen, relative * across, slopes[0]), jnp.where(seen, relative * along, slopes[1])
         number = jnp.where(seen, first + n, number)
+    if config.shadows:
+        whole = coverage.Layer(safe_inverse(depth), jnp.ones(shape), shown, slopes[0], number)
+        shown = _with_shadows(config, frame, rays, (whole,))[0].value
     factor = _factor(config, frame, number, rays, jnp.where(share > 0, depth, 0.0), slopes)
     return behind + share * (shown * factor - behind)
 
@@ -81,6 +95,8 @@ def _backdrop(config: CameraConfig, frame: Frame, rays: Rays) -> Array:
 def blend_layers(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Array:
     """Returns brightness [H, W] of the layers over ground and sky."""
     behind = _backdrop(config, frame, rays)
+    if config.shadows and layers:
+        layers = _with_shadows(config, frame, rays, layers)
     for layer in reversed(layers):
         met = layer.closeness > 0
         near = jnp.where(met, safe_inverse(layer.closeness), 0.0)
@@ -112,7 +128,7 @@ def _tilted_picture(
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
     light, first = raycast.daylight_of(config, scene.daylight), raycast.first_numbers(value)
     surfaces = surfaces_at_eye(scene, first, origin)
-    layers = coverage.no_layers((config.height, config.width), numbered=surfaces is not None)
+    layers = coverage.no_layers((config.height, config.width), numbered=columns.has_numbers(config, surfaces))
     for kind, met in raycast.hits(scene, origin, many, without=("spheres", "planes")).items():
         bright = raycast.brightness_of(light, met, value[kind])
         layers = coverage.add_sampled_layers(met, bright, first[kind], many, layers)
@@ -172,7 +188,8 @@ def render_depth(config: CameraConfig, scene: Scene, position: Array, rotation: 
 
 def _pictures_natively(platform: str, config: CameraConfig, _: columns.Finish, *image: Any) -> Array | None:
     """Returns brightness [M, H, W] by the library in C or CUDA, blended as by `blend_layers`; None if unsupported."""
-    return native.render_luma(config, *image) if native.can_render(image[0], platform) else None
+    can = native.can_render(image[0], platform) and not config.shadows
+    return native.render_luma(config, *image) if can else None
 
 
 def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:

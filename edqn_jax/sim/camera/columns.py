@@ -54,7 +54,7 @@ class Frame:
 
     origin: Array  # [3] metres
     heading: Array  # [2] cosine and sine
-    scene: Scene  # without the upright boxes and cylinders
+    scene: Scene  # without the upright boxes and cylinders, unless these cast shadows
     value: Values
     sky: Array  # []
     surfaces: Surface | None  # of all shapes (`surfaces.surfaces_at_eye`)
@@ -75,6 +75,11 @@ class _Rows:
     def take(self, numbers: Array) -> Frame:
         """Returns the frames of these numbers, [B, ...]."""
         return jax.vmap(self.frame)(self.rows.at[numbers].get(mode="promise_in_bounds"))
+
+
+def has_numbers(config: CameraConfig, surfaces: Surface | None) -> bool:
+    """Returns whether layers say which shape they show: where shapes have surfaces of their own, or cast shadows."""
+    return surfaces is not None or config.shadows
 
 
 Finish = Callable[[CameraConfig, Frame, Rays, Layers], Array]
@@ -131,7 +136,7 @@ def _frame(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, w
     value = raycast.albedo_values(scene, weights)
     forward_x, forward_y = rotation[0, 0], rotation[1, 0]
     heading = jnp.stack([forward_x, forward_y]) * lax.rsqrt(jnp.maximum(forward_x**2 + forward_y**2, TINY))
-    rest = scene.with_shapes({kind: no_shapes(kind) for kind in raycast.UPRIGHT})
+    rest = scene if config.shadows else scene.with_shapes({kind: no_shapes(kind) for kind in raycast.UPRIGHT})
     frame = Frame(
         origin=origin,
         heading=heading,
@@ -252,7 +257,7 @@ def _other_shapes(frame: Frame, spheres: bool) -> int:
 
 def _layers_of_others(config: CameraConfig, frame: Frame, u: Array, depth: int, spheres: bool) -> Layers:
     """Returns the `depth` nearest layers of one column, [H, 1] pixels, of all but the upright shapes."""
-    layers = coverage.no_layers((config.height, 1), depth, numbered=frame.surfaces is not None)
+    layers = coverage.no_layers((config.height, 1), depth, numbered=has_numbers(config, frame.surfaces))
     light, first = raycast.daylight_of(config, frame.scene.daylight), raycast.first_numbers(frame.value)
     many, rays = _rays(config, frame, u, config.samples_across, config.samples_down), _rays(config, frame, u)
     for kind, met in raycast.hits(frame.scene, frame.origin, many, without=EXACT).items():
@@ -277,7 +282,7 @@ def _take_sides(
     picked = rows.at[columns.number[None] * (none + 1) + index].get(mode="promise_in_bounds")
     boxes = columns.frame.value["boxes"].shape[1]
     mixed = index >= boxes if boxes < none else None
-    own, numbers = columns.frame.scene.daylight, None if columns.frame.surfaces is None else index
+    own, numbers = columns.frame.scene.daylight, index if has_numbers(config, columns.frame.surfaces) else None
     light = own if own is None else dataclasses.replace(own, sun=jnp.moveaxis(own.sun, -1, 0))
     light = raycast.daylight_of(config, light)
     return words, coverage.column_sides(config, light, picked, mixed, boxes, columns.frame.heading, columns.u, numbers)

@@ -57,7 +57,7 @@ class Layer:
     coverage: Array  # [H, W] share of the pixel's area, in [0, 1]
     value: Array  # [H, W] brightness times coverage
     slope: Array  # [H, W] change of closeness per pixel rightwards; LEVEL_FACE on horizontal faces
-    shape: Array | None = None  # [H, W] its number (`raycast.first_numbers`), where shapes have surfaces of their own
+    shape: Array | None = None  # [H, W] its number (`raycast.first_numbers`), where `columns.has_numbers`
 
 
 Layers = tuple[Layer, ...]
