@@ -27,6 +27,11 @@ REAL = {BLIND: (), DEPTH: (), "events": REAL_EVENTS, "frames": REAL_FRAMES, "fra
 
 LUX = (0.1, 1.0, 10.0, 100.0, 10_000.0)
 
+SUNNY_LUX, SHADE = 10_000.0, 0.01
+"""Light of a clear day, as much as there is here; brightness in the shade as a share of that in the sun."""
+SHADOWS = {"no shadows": False, "shadows": True}
+"""By condition: `camera.shadows`."""
+
 AGES = (BLIND, DEPTH, "depth-late-1", "depth-late-2", "events", *FRAMES[:2])
 CLOCK = "@"
 """Before the frames a second of a camera that has a clock, in a sensor's name; others take theirs at the decision."""
@@ -115,6 +120,19 @@ AXES: dict[str, Axis] = {
         REAL,
         {f"{lux:g} lux": {"light": {"least_lux": lux, "most_lux": lux}} for lux in LUX},
         ("--light.least-lux", str(LUX[0]), "--light.most-lux", str(LUX[-1])),
+        same_flown=True,
+    ),
+    "shade": Axis(
+        "Sun and shade a hundred times darker",
+        ("medium", "rooms"),
+        {name: ("--camera.shadows",) if cast else () for name, cast in SHADOWS.items()},
+        REAL,
+        {name: {"camera": {"shadows": cast}} for name, cast in SHADOWS.items()},
+        (
+            *("--surface.pattern", "plaid", "--camera.ambient", str(SHADE)),
+            *("--light.least-lux", str(SUNNY_LUX), "--light.most-lux", str(SUNNY_LUX)),
+        ),
+        same_trained=True,
         same_flown=True,
     ),
     "turning": Axis(

@@ -91,6 +91,19 @@ def test_late_balls_come_at_25_decisions_a_second() -> None:
     assert config.world.ball_seconds == (0.3, 1.0) and config.world.ball_radii_m == (0.15, 0.3)
 
 
+def test_shade_is_trained_and_flown_without_and_with_cast_shadows() -> None:
+    axis = AXES["shade"]
+    configs = [config_of(axis, Place("medium", name, "frame-pair"), SMALL) for name in axis.trained]
+    assert [config.camera.shadows for config in configs] == [False, True]
+    assert {(config.camera.ambient, config.surface.pattern) for config in configs} == {(0.01, "plaid")}
+    assert all(config.exposure.real and config.light.least_lux == 10_000 for config in configs)
+    assert [layer["camera"]["shadows"] for layer in flown_of(axis, "events").values()] == [False, True]
+    places = places_of(axis, ["medium"], list(axis.trained), list(axis.sensors))
+    assert (
+        len(places) == 2 + 3 * 2 and len(flown_of(axis, "depth")) == 1
+    )  # depth and nothing do not change in the shade
+
+
 def test_a_camera_with_a_clock_has_its_rate_and_latency_and_counts_as_frames() -> None:
     config = config_of(AXES["age"], Place("court", "0.3 to 1 s", "frame-pair@60"), SMALL)
     assert (config.env.sensor, config.exposure.rate_hz, config.exposure.latency_s) == ("frame-pair", 60, 0.015)

@@ -88,11 +88,12 @@ def test_a_pillar_throws_a_shadow_as_long_as_the_sun_is_low() -> None:
     config = dataclasses.replace(
         CONFIG, mount="body", width=81, height=61, sun_elevation_deg=45.0, sun_azimuth_deg=180.0
     )
-    down = np.array(
-        [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
-    )  # columns: ahead is down, left is +y, up is +x
+    # Looking straight down, +x upwards in the picture: columns are ahead, left and up.
+    down = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
     # The sun is towards -x at 45 degrees, so the shadow of 6 m ends 6 m beyond the pillar, towards +x.
-    kept, lit = share_of_sun(config, scene_of(GROUND, pillar(30, 30, 3, 0.5, 3)), [[30.0, 30.0, 20.0]], [down])
+    kept, lit = share_of_sun(
+        config, scene_of(GROUND, pillar(30, 30, 3, 0.5, 3)), np.array([[30.0, 30.0, 20.0]]), down[None]
+    )
     way = np.linspace(1.2, 15.0, 400)
     pitch = raycast.pitch_of(config)
     row = np.round(30 - way / 20.0 / pitch).astype(int)
