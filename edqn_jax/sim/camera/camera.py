@@ -51,7 +51,7 @@ def _with_shadows(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers
     light = raycast.daylight_of(config, frame.scene.daylight)
     joined: coverage.Layer = jax.tree.map(lambda *parts: jnp.stack(parts), *layers)
     depth = jnp.where(joined.closeness > 0, safe_inverse(joined.closeness), 0.0)
-    dark = shadows.in_shadow(frame.scene, light, frame.value, frame.origin, rays, depth, joined.shape)
+    dark = shadows.in_shadow(frame.scene, light, frame.origin, rays, depth)
     ambient = joined.coverage * shadows.ambient_of(light, frame.value, joined.shape)
     values = jnp.where(dark, ambient, joined.value)
     return tuple(dataclasses.replace(layer, value=value) for layer, value in zip(layers, values, strict=True))

@@ -14,10 +14,9 @@ import pytest
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim.camera import camera, raycast, shadows
+from edqn_jax.sim.camera import camera, raycast
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.sim.scene.shapes.kind import kinds
 from tests.oracles import camera_plain, mujoco_shadows
 from tests.oracles.mujoco_depth import RayCaster
 from tests.support.drawn_scenes import GROUND, every_kind, free_points, pillar, rotation_of, scene_of
@@ -100,8 +99,3 @@ def test_a_pillar_throws_a_shadow_as_long_as_the_sun_is_low() -> None:
     found = kept[0, row, 40]
     assert lit[0, row, 40].all() and np.all((found < 0.5) == (way < 6.5), where=abs(way - 6.5) > 20 * pitch)
     assert np.allclose(kept[0, 30:, 40][lit[0, 30:, 40]][8:], 1.0)  # nothing on the sun's side
-
-
-def test_every_kind_whose_shapes_are_not_in_their_own_way_is_there() -> None:
-    assert set(shadows.CONVEX) <= set(kinds())
-    assert set(kinds()) - set(shadows.CONVEX) >= {"planes", "fields"}
