@@ -49,7 +49,7 @@ def _factor(
 def _with_shadows(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Layers:
     """Returns the layers with the shadows that are cast on them: there, `Layer.value` is that of the ambient light."""
     light = raycast.daylight_of(config, frame.scene.daylight)
-    joined: coverage.Layer = jax.tree.map(lambda *parts: jnp.stack(parts), *layers)
+    joined: Any = jax.tree.map(lambda *parts: jnp.stack(parts), *layers)
     depth = jnp.where(joined.closeness > 0, safe_inverse(joined.closeness), 0.0)
     dark = shadows.in_shadow(frame.scene, light, frame.origin, rays, depth)
     ambient = joined.coverage * shadows.ambient_of(light, frame.value, joined.shape)
