@@ -7,7 +7,7 @@ r"""Makes a policy that comes with the package: trains five seeds, measures the 
     python scripts/pretrain.py --kind autopilot --world narrow --start-from runs/looks-further --run runs/autopilot \
         --seeds 1 --measured runs/looks.md --out edqn_jax/policies/pretrained-looks
     python scripts/pretrain.py --kind late --world narrow --start-from edqn_jax/policies/pretrained-looks \
-        --run runs/late --seeds 1 --out runs/late-looks
+        --run runs/late --seeds 1 --out edqn_jax/policies/pretrained-late
     python scripts/pretrain.py --kind body --world narrow --start-from edqn_jax/policies/pretrained-looks \
         --run runs/body --seeds 1 --out edqn_jax/policies/pretrained-body
 
@@ -89,7 +89,7 @@ KINDS: dict[str, tuple[int, tuple[str, ...]]] = {
     "looks": (220_000_000, LOOKS),
     "further": (185_000_000, (*LOOKS, *AGAIN, "--encoder.retrain-at", "0.05", "0.35")),
     "autopilot": (370_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, "--encoder.retrain-at", "0.05", "0.35")),
-    "late": (370_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, *LATE, "--encoder.retrain-at", "0.05", "0.35")),
+    "late": (170_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, *LATE, "--encoder.retrain-at", "0.05", "0.35")),
     "body": (150_000_000, (*LOOKS, *AGAIN, *AUTOPILOT, *BODY, "--encoder.retrain-at", "0.06", "0.3")),
 }
 """Decisions of each seed, 0 as `DECISIONS`, and further options, by the kind of policy: of one plaid, of any look, the

@@ -34,8 +34,8 @@ class EvaluateArgs:
     """Fly a policy on missions in any world and print metrics."""
 
     run: Annotated[Positional[Path], arg(metavar="POLICY")]
-    """Folder of a run, or `pretrained`, `pretrained-looks` or `pretrained-body`, which come with the package; or any
-    function of your own, as `module:name` or `path/to/file.py:name`."""
+    """Folder of a run, or `pretrained`, `pretrained-looks`, `pretrained-late` or `pretrained-body`, which come with the
+    package; or any function of your own, as `module:name` or `path/to/file.py:name`."""
     world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
     """Where to fly: `paper`, an MJCF file, or test worlds of a family (default: where training was)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None

@@ -20,7 +20,8 @@ class ExportArgs:
     """Write a policy as ONNX, for a computer without JAX, and beside it the runner that flies it; compare both."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of the run, or a policy of the package: `pretrained`, `pretrained-looks` or `pretrained-body`."""
+    """Folder of the run, or a policy of the package: `pretrained`, `pretrained-looks`, `pretrained-late` or
+    `pretrained-body`."""
     out: Annotated[Path, arg(metavar="FILE.onnx")]
     """File to write; it replaces one of that name."""
     checks: Annotated[int, arg(metavar="N")] = 1000

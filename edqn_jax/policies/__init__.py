@@ -8,11 +8,12 @@ from pathlib import Path
 
 from edqn_jax.errors import ConfigError
 
-PRETRAINED, LOOKS, BODY = "pretrained", "pretrained-looks", "pretrained-body"
-"""Names of the policies for random worlds, open and closed ones: of one plaid, of surfaces of any look, and of any look
-with a camera on the body."""
+PRETRAINED, LOOKS = "pretrained", "pretrained-looks"
+LATE, BODY = "pretrained-late", "pretrained-body"
+"""Names of the policies for random worlds, open and closed ones: of one plaid, and of surfaces of any look; of any look
+also where moves may be late, and with a camera on the body."""
 
-SHIPPED = (PRETRAINED, LOOKS, BODY)
+SHIPPED = (PRETRAINED, LOOKS, LATE, BODY)
 
 
 def function_named(name: str | Path) -> tuple[str, str] | None:

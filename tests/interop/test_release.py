@@ -22,6 +22,7 @@ WHEEL = {*WANTED, "edqn_jax-0.1.0.dist-info/METADATA", "edqn_jax-0.1.0.dist-info
         "edqn_jax/py.typed",
         "edqn_jax/policies/pretrained/config.yaml",
         "edqn_jax/policies/pretrained-looks/config.yaml",
+        "edqn_jax/policies/pretrained-late/config.yaml",
         "edqn_jax/policies/pretrained-body/config.yaml",
         "edqn_jax-0.1.0.dist-info/licenses/LICENSE",
     ],

@@ -12,10 +12,13 @@ import pytest
 
 import edqn_jax
 from edqn_jax.cli.train import parse_train
-from edqn_jax.policies import BODY, LOOKS, PRETRAINED, SHIPPED, policy_folder
+from edqn_jax.policies import BODY, LATE, LOOKS, PRETRAINED, SHIPPED, policy_folder
 from edqn_jax.runs.directory import version_of
 
 FOLDER = policy_folder(Path(PRETRAINED))
+
+KINDS = {PRETRAINED: "plaid", LOOKS: "autopilot", LATE: "late", BODY: "body"}
+"""Of `scripts/pretrain.py`."""
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -72,7 +75,7 @@ def test_its_script_trains_with_its_options(name: str, monkeypatch: pytest.Monke
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
     options = edqn_jax.load_policy(name).config
     script = import_module("pretrain")
-    words = script.options_of(options.world.name, {PRETRAINED: "plaid", LOOKS: "autopilot", BODY: "body"}[name])
+    words = script.options_of(options.world.name, KINDS[name])
     _, asked = parse_train(words)
     if name != PRETRAINED:  # began with a policy of any look
         assert parse_train([*words, "--start-from", LOOKS])[1] == asked
@@ -95,7 +98,8 @@ def test_the_kind_late_is_that_of_the_autopilot_with_moves_that_are_late_in_half
     autopilot, late = (parse_train([*script.options_of("narrow", kind), *begin])[1] for kind in ("autopilot", "late"))
     assert (late.env.action_delay, late.env.delay_share, late.agent.last_move) == (1, 0.5, True)
     env = dataclasses.replace(autopilot.env, action_delay=1, delay_share=0.5)
-    assert late == dataclasses.replace(autopilot, env=env, agent=dataclasses.replace(autopilot.agent, last_move=True))
+    agent, train = dataclasses.replace(autopilot.agent, last_move=True), late.train
+    assert late == dataclasses.replace(autopilot, env=env, agent=agent, train=train)
 
 
 def test_the_best_seed_is_that_of_the_validation_worlds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
