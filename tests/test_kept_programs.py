@@ -85,6 +85,7 @@ def test_what_jax_has_kept_is_not_kept_again_and_runs(tmp_path: Path) -> None:
 def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """The folder in which this process keeps programs, for the time of a test."""
     monkeypatch.setattr(cache, "_enabled", [tmp_path])
+    monkeypatch.setattr(user_code, "IMPORTED", [])  # by other tests of this process
     return tmp_path
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import types
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from edqn_jax.cli import evaluate, main
 from edqn_jax.devices import devices
 from edqn_jax.evaluation import latency
-from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.learn.policy import Policy
 from tests.support.corridors import corridor
 from tests.support.meshes import LUMP
@@ -91,8 +92,10 @@ def test_names_that_look_like_markup_are_printed_as_they_are(
 def test_evaluate_prints_the_warnings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def flown(policy: Policy, world: str, **_: object) -> types.SimpleNamespace:
-        return types.SimpleNamespace(missions=load_missions(policy.config, world), figures={})
+    def flown(policy: Policy, world: str, announce: Callable[[MissionSet], None], **_: object) -> types.SimpleNamespace:
+        missions = load_missions(policy.config, world)
+        announce(missions)
+        return types.SimpleNamespace(missions=missions, figures={})
 
     corridor(tmp_path, 1.4)
     monkeypatch.setattr(evaluation, "evaluate", flown)
