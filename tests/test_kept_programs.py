@@ -18,6 +18,7 @@ from edqn_jax import kept_programs, user_code
 from edqn_jax.config import registry
 from edqn_jax.devices import cache
 from edqn_jax.kept_programs import Place, place_of
+from edqn_jax.registries import Registry
 
 ARGUMENTS = (jnp.arange(3.0), {"keys": jax.random.split(jax.random.key(0), 2)})
 
