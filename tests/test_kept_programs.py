@@ -86,7 +86,12 @@ def test_what_jax_has_kept_is_not_kept_again_and_runs(tmp_path: Path) -> None:
 def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """The folder in which this process keeps programs, for the time of a test."""
     monkeypatch.setattr(cache, "_enabled", [tmp_path])
-    monkeypatch.setattr(user_code, "IMPORTED", [])  # by other tests of this process
+    # Not what other tests of this process have imported and registered.
+    monkeypatch.setattr(user_code, "IMPORTED", [])
+    for entries in vars(registry).values():
+        if isinstance(entries, Registry) and entries.own:
+            built_in = {name: entries._entries[name] for name in entries.names if name not in entries.own}
+            monkeypatch.setattr(entries, "_entries", built_in)
     return tmp_path
 
 
