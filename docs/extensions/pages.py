@@ -19,6 +19,7 @@ ELSEWHERE = {
     "CHANGELOG.md": "changelog",
     "edqn_jax/policies/pretrained/README.md": "pretrained",
     "edqn_jax/policies/pretrained-looks/README.md": "pretrained-looks",
+    "edqn_jax/policies/pretrained-late/README.md": "pretrained-late",
     "edqn_jax/policies/pretrained-body/README.md": "pretrained-body",
 }
 """Page of the site that shows Markdown from outside of `docs/`; in the repository it has a link alone."""
