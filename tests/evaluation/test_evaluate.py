@@ -211,7 +211,9 @@ def test_the_command_flies_under_the_conditions_that_it_is_given_and_says_so(run
     assert "was trained with" not in capsys.readouterr().out
     with pytest.raises(ConfigError, match="body.mass_share must be at least 0 and less than 1, not 2.0"):
         evaluate_command(EvaluateArgs(run, conditions={"body": {"mass_share": 2.0}}))
-    with pytest.raises(ConfigError, match="'agent.history' is a policy's own; conditions are env, events, air, body"):
+    with pytest.raises(
+        ConfigError, match="'agent.history' is a policy's own; conditions are camera, env, events, air, body"
+    ):
         evaluate_command(EvaluateArgs(run, conditions={"agent": {"history": 3}}))
 
 
