@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from edqn_jax.sim.scene.mjcf_parts.geoms import thickness_of
 from edqn_jax.sim.scene.mjcf_parts.solids import field_mesh
@@ -26,7 +26,7 @@ class TriangleSolid:
 
     triangles: NDArray[np.float64]
     """[F, 3, 3] metres, in the geom's axes, which MuJoCo moves with its body."""
-    tree: KDTree
+    tree: scipy.spatial.KDTree
     reach: float
     """Most metres from the middle of a triangle to its corners."""
     half: float = 0.0
@@ -75,4 +75,4 @@ def _solid(vertices: NDArray[np.float64], faces: NDArray[np.integer], thickness:
     triangles = divided[0][divided[1]]
     middles = triangles.mean(1)
     reach = float(np.linalg.norm(triangles - middles[:, None], axis=2).max())
-    return TriangleSolid(triangles, KDTree(middles), reach, thickness / 2)
+    return TriangleSolid(triangles, scipy.spatial.KDTree(middles), reach, thickness / 2)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import scipy
 from jax import Array
-from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from edqn_jax.planning.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small
 from edqn_jax.planning.path import point_text
@@ -81,7 +79,7 @@ def _parts(lattice: Lattice, clearance: np.ndarray) -> np.ndarray:
     such cells are found first, and are then joined through the cells near surfaces and along diagonals.
     """
     number = np.zeros(clearance.shape, np.int32)
-    ndimage.label(clearance >= lattice.radius + lattice.cell / 2, output=number)
+    scipy.ndimage.label(clearance >= lattice.radius + lattice.cell / 2, output=number)
     near = (clearance >= lattice.radius) & (number == 0)
     number[near] = 1 + number.max() + np.arange(np.count_nonzero(near))
     pairs = []
@@ -91,8 +89,8 @@ def _parts(lattice: Lattice, clearance: np.ndarray) -> np.ndarray:
         pairs.append(np.stack([number.ravel()[origins[joined]], number.ravel()[cells[joined]]]))
     first, second = np.concatenate(pairs, axis=1)
     nodes = int(number.max()) + 1
-    graph = coo_array((np.ones(len(first)), (first, second)), (nodes, nodes))
-    _, parts = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(len(first)), (first, second)), (nodes, nodes))
+    _, parts = scipy.sparse.csgraph.connected_components(graph, directed=False)
     return parts[number]
 
 

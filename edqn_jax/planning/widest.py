@@ -15,8 +15,8 @@ import dataclasses
 import math
 
 import numpy as np
+import scipy
 from jax import Array
-from scipy import ndimage
 
 from edqn_jax.planning.astar import search_lattice, shortest_path
 from edqn_jax.planning.free_space import COARSE_M
@@ -57,7 +57,7 @@ class WidestWay:
         apart = [np.linalg.norm(self.points - end, axis=1) for end in (self.points[0], self.points[-1])]
         between = np.minimum(*apart) > ENDS_M
         clearance = np.where(between | ~between.any(), self.clearance, np.inf)
-        alike, _ = ndimage.label(clearance <= clearance.min() + _RESOLVED_M)  # pyright: ignore[reportGeneralTypeIssues]
+        alike, _ = scipy.ndimage.label(clearance <= clearance.min() + _RESOLVED_M)  # pyright: ignore[reportGeneralTypeIssues]
         number = np.flatnonzero(alike == alike[np.argmin(clearance)])
         return int(number[len(number) // 2])
 
@@ -136,10 +136,10 @@ class _Openings(Lattice):
             self._longest = math.sqrt(directions) * self.cell
             near = self._near_ends(np.array(target)) & (clearance >= max(self.radius, self._longest / 2))
             room = np.where(near, np.inf, clearance)
-            structure = ndimage.generate_binary_structure(3, directions)
+            structure = scipy.ndimage.generate_binary_structure(3, directions)
 
             def joins(need: float, room=room, structure=structure) -> bool:
-                ndimage.label(room >= need, structure, output=parts)
+                scipy.ndimage.label(room >= need, structure, output=parts)
                 return bool(parts[tuple(self.origin)] == parts[target] != 0)
 
             low, high = self._longest / 2, float(clearance.max())

@@ -9,7 +9,8 @@ import contextlib
 import dataclasses
 import functools
 import io
-from typing import Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ from edqn_jax.sim.physics.rigid_body import RigidBody, rigid_body_step
 from edqn_jax.sim.physics.scalarize import scalarize
 from edqn_jax.xla import materialise_tree
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
+if TYPE_CHECKING:
     from mujoco import mjx
 
 
@@ -87,8 +88,18 @@ def _applied(airframe: Airframe, state: DroneState, thrust: Array, load: Load) -
 
 
 @functools.cache
+def _mjx_module() -> ModuleType:
+    """Imports MJX, which takes as long as importing JAX, where a program is traced: one that was kept needs none."""
+    # Its constants must not belong to what is being traced, and it prints that Warp, not used here, is missing.
+    with jax.ensure_compile_time_eval(), contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx
+
+
+@functools.cache
 def _mjx_template(config: DroneConfig) -> tuple[mjx.Model, mjx.Data]:
     """Returns the airframe as MJX has it, and data that hold its factored mass matrix; known when tracing."""
+    mjx = _mjx_module()
     model = c_model(config)
     rest = mujoco.MjData(model)
     mujoco.mj_forward(model, rest)
@@ -120,6 +131,7 @@ def _mjx_step(config: DroneConfig, state: DroneState, applied: Array) -> tuple[A
         state: before the step.
         applied: [6] force (N, world) and torque (N m, body).
     """
+    mjx = _mjx_module()
     model, template = _mjx_template(config)
 
     def at(state: DroneState) -> mjx.Data:

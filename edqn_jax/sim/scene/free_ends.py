@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import label, map_coordinates
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.mesh_field import Grid
@@ -56,7 +54,7 @@ def find_ends(
     distance = _distances(grid, points - middle)
     free = distance >= radius + ROOM_M
     free &= points[..., 2] - low[2] >= radius + ROOM_M
-    parts, count = label(free)  # pyright: ignore[reportGeneralTypeIssues]
+    parts, count = scipy.ndimage.label(free)  # pyright: ignore[reportGeneralTypeIssues]
     if not count:
         raise ConfigError(f"there is no place with {radius + ROOM_M:g} m of room; give --scale, or --start and --goal")
     roofed = _is_roofed(distance)
@@ -86,7 +84,7 @@ def _distances(grid: Grid, places: NDArray[np.float64]) -> NDArray[np.float64]:
     reach = grid.cell * (np.array(grid.values.shape) - 1) / 2
     at = np.moveaxis((places + reach) / grid.cell, -1, 0)
     beyond = np.linalg.norm(np.maximum(np.abs(places) - reach, 0.0), axis=-1)
-    return map_coordinates(grid.values, at, order=1, mode="nearest") + beyond
+    return scipy.ndimage.map_coordinates(grid.values, at, order=1, mode="nearest") + beyond
 
 
 def _is_roofed(distance: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -116,10 +114,10 @@ def _far_apart(part: NDArray[np.bool_], ends: NDArray[np.bool_], first: np.intp 
         a, b = moved[:-1].ravel(), moved[1:].ravel()
         pairs.append(np.stack([a, b], axis=1)[(a >= 0) & (b >= 0)])
     a, b = np.concatenate(pairs).T
-    graph = coo_matrix((np.full(len(a), cell), (a, b)), shape=(len(flat), len(flat))).tocsr()
+    graph = scipy.sparse.coo_matrix((np.full(len(a), cell), (a, b)), shape=(len(flat), len(flat))).tocsr()
 
     def farthest(of: int) -> int:
-        away = dijkstra(graph, directed=False, indices=of)
+        away = scipy.sparse.csgraph.dijkstra(graph, directed=False, indices=of)
         return int(np.argmax(np.where(allowed & np.isfinite(away) & (away <= LONGEST_M), away, -1.0)))
 
     if first is None:

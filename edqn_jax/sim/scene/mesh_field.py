@@ -17,9 +17,8 @@ import itertools
 from functools import lru_cache
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
-from scipy.spatial import ConvexHull, QhullError
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.kept_grids import KEPT_VALUES, kept_values
@@ -221,8 +220,8 @@ def hull_of(vertices: Numbers) -> tuple[Numbers, NDArray[np.int64]]:
         ConfigError: if all lie in a plane.
     """
     try:
-        hull = ConvexHull(vertices)
-    except QhullError:
+        hull = scipy.spatial.ConvexHull(vertices)
+    except scipy.spatial.QhullError:
         raise ConfigError("the mesh is flat; use a thin box, or a plane") from None
     a, b, c = np.moveaxis(vertices[hull.simplices], 1, 0)
     outwards = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) > 0
@@ -300,7 +299,7 @@ def _lowered_values(vertices: Numbers, faces: NDArray[np.integer], half: Numbers
     between = cell * (at - (np.array(fine.shape) - 1) / 2) / 2
     excess = np.zeros(fine.shape)
     excess[near] = _UNSEEN * (fine[near] - convex_distances(between, vertices, faces))
-    lowering = maximum_filter(excess, size=5)[::2, ::2, ::2]
+    lowering = scipy.ndimage.maximum_filter(excess, size=5)[::2, ::2, ::2]
     # Further away the distance bends by at most 1 / distance in two directions.
     far = exact > (_BAND - 1) * cell
     lowering[far] = np.maximum(lowering[far], cell**2 / (4 * exact[far]))

@@ -18,9 +18,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jax import Array, lax
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 EXACT_CELLS = 2.5
 """Cells from the surface up to which distances are exact."""
@@ -125,7 +125,7 @@ def _far_distances(table: Array, nearest: NDArray[np.int32], near: NDArray[np.fl
     """
     far = ~np.isfinite(near)
     places = np.argwhere(far).astype(np.int32)
-    layers = np.ceil(np.asarray(distance_transform_edt(far))[far] - 1e-3).astype(np.int32)
+    layers = np.ceil(np.asarray(scipy.ndimage.distance_transform_edt(far))[far] - 1e-3).astype(np.int32)
     order = np.argsort(layers, kind="stable")
     points = (cell * (places[order] - (np.array(near.shape) - 1) / 2)).astype(np.float32)
     known = np.pad(np.where(far, -1, nearest), _STEP, constant_values=-1).astype(np.int32)

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.free_ends import find_ends
@@ -236,7 +236,7 @@ def _check_spacing(file: Path, points: NDArray[np.float64], thickness: float) ->
         ConfigError: says how far.
     """
     some = points[:: max(1, len(points) // _NEAREST)]
-    apart = float(np.quantile(KDTree(points).query(some, k=2)[0][:, 1], 0.9))
+    apart = float(np.quantile(scipy.spatial.KDTree(points).query(some, k=2)[0][:, 1], 0.9))
     if apart > thickness:
         raise ConfigError(
             f"the points of '{file}' lie {apart:.2g} m apart, and a surface of {thickness:g} m would have holes; give "
