@@ -7,6 +7,7 @@ row is the median of repeats in each of which every row ran once.
 
     python benchmarks/throughput.py --json throughput.json
     python benchmarks/throughput.py -- --num-envs 1024 --agent.updates-per-step 16
+    python benchmarks/throughput.py --whole-only --hours benchmarks/hours.tsv
 
 Arguments after -- are options of train.py.
 """
@@ -19,6 +20,7 @@ import argparse
 import statistics
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -27,12 +29,13 @@ from jax.sharding import Mesh
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
-from edqn_jax.devices.hardware import count_cores
+from edqn_jax.devices.hardware import count_cores, describe_processor
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
+from edqn_jax.files import check_can_write
 from edqn_jax.learn.trainer import AXIS
 from edqn_jax.runs.provenance import describe_workload
-from measurement import json_report
+from measurement import hours, json_report
 from measurement.ceilings import Rollout, ceilings
 from measurement.conditions import Watch, conditions
 from measurement.flags import parse_config, split
@@ -54,14 +57,19 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     """Returns the parsed arguments, and the configuration that is timed.
 
     Raises:
-        ConfigError: if the options after -- are invalid, or the file cannot be written.
+        ConfigError: if the options after -- are invalid, or a file cannot be written or is no table of runs.
     """
     words, flags = split(argv)
     parser = Parser("throughput", __doc__)
     parser.add_argument("--repeats", type=at_least_one, default=REPEATS, help=f"turns of each row (default {REPEATS})")
     parser.add_argument("--quick", action="store_true", help="one short turn of each row")
     parser.add_argument("--whole-only", action="store_true", help="do not time the parts")
+    parser.add_argument("--hours", type=Path, help="add the run to this table, and show the medians of its runs")
     args = parser.parse(words)
+    args.options = flags
+    if args.hours is not None:
+        hours.read(args.hours)
+        check_can_write(args.hours)
     config = parse_config(flags)
     if config.env.sensor != "events" and not args.whole_only:
         raise ConfigError(f"parts can be timed only for env.sensor events; {config.env.sensor} needs --whole-only")
@@ -195,6 +203,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     report = measure(config, 1 if args.quick else args.repeats, not args.whole_only)
     print(table(report))
     json_report.write(args.json, report)
+    if args.hours is not None:
+        row = hours.row_of(report, describe_processor(), args.options)
+        print(hours.summary(hours.add(args.hours, row), row))
     return 0
 
 

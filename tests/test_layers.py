@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 from collections import Counter
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -66,18 +67,22 @@ PACKAGE = modules_below(ROOT / "edqn_jax")
 FACES = {"edqn_jax", "edqn_jax.__main__"}
 """They stand above all places."""
 
-ARROWS = {name: imported_by(file.read_text(encoding="utf-8"), PACKAGE) for name, file in PACKAGE.items()}
+
+@functools.cache
+def arrows() -> dict[str, set[str]]:
+    """Returns what each module imports."""
+    return {name: imported_by(file.read_text(encoding="utf-8"), PACKAGE) for name, file in PACKAGE.items()}
 
 
 @pytest.mark.parametrize("name", sorted(PACKAGE.keys() - FACES))
 def test_a_module_imports_from_its_own_place_and_from_those_below(name: str) -> None:
     above = ORDER[ORDER.index(place_of(name)) + 1 :]
-    assert [to for to in sorted(ARROWS[name]) if to in FACES or place_of(to) in above] == []
+    assert [to for to in sorted(arrows()[name]) if to in FACES or place_of(to) in above] == []
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
     try:
-        TopologicalSorter(ARROWS).prepare()
+        TopologicalSorter(arrows()).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
 

@@ -220,6 +220,6 @@ def _load_library(
             return ctypes.CDLL(str(library))
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         made = Path(scratch) / library.name
-        subprocess.run([*command, "-o", str(made)], check=True, capture_output=True, timeout=60)
+        subprocess.run([*command, "-o", str(made)], check=True, capture_output=True, timeout=300)
         made.replace(library)
     return ctypes.CDLL(str(library))

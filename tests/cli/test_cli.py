@@ -362,6 +362,7 @@ def test_help_versions_and_completion_do_not_start_jax():
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.whole
 def test_a_simulated_flights_world_is_looked_at_before_its_packages(monkeypatch):
     monkeypatch.setitem(sys.modules, "edqn_jax.fly.simulated.missions", None)  # as where its extra is not installed
     args = parse_fly(["pretrained-looks", "--simulate", "rums"])

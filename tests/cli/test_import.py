@@ -58,6 +58,7 @@ NOT_IMPORTED = {
 """Text of each file, and what is said of it."""
 
 
+@pytest.mark.whole
 def test_what_cannot_be_imported_is_named(tmp_path: Path) -> None:
     for name, (text, _) in NOT_IMPORTED.items():
         if text is not None:

@@ -76,7 +76,7 @@ def test_streams_of_somebody_else_are_left_as_they_are(monkeypatch: pytest.Monke
     assert notebook.getvalue() == "shown\n"
 
 
-@pytest.mark.parametrize("streams", ["2>&1 >&- | true", "", *in_whole(">&-", "2>&-", "<&- >&- 2>&-", "| true")])
+@pytest.mark.parametrize("streams", ["2>&1 >&- | true", *in_whole("", ">&-", "2>&-", "<&- >&- 2>&-", "| true")])
 def test_a_live_panel_goes_on_whoever_reads(streams: str, tmp_path: Path) -> None:
     done = tmp_path / "done"
     script = f'{{ "$PYTHON" -c "$1" {streams}; }} 2>/dev/null; echo "${{PIPESTATUS[0]}}" > "$2"'

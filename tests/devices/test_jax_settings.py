@@ -81,6 +81,7 @@ def wide(tree: Any) -> set[str]:
     return {str(x.dtype) for x in jax.tree.leaves(tree) if "64" in str(getattr(x, "dtype", ""))}
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_what_is_flown_is_the_same_in_double_precision_and_strictness() -> None:
     environment = edqn_jax.make(WORLD)

@@ -17,6 +17,7 @@ from edqn_jax.devices import sums
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.xla_flags import YNN_OPTION, disable_ynn_fusions
+from tests.support.marks import rows_in_whole
 
 SIZES = (16_384, 16_385, 32_768, 32_769, 49_153, 65_535, 65_537, 98_305, 131_071, 131_072, 131_073)
 
@@ -65,7 +66,7 @@ print(float(wide(jnp.ones((2, 2, 6)), jnp.ones((2, 2, 6, 3, 3, 3, 3, 3))).sum())
 """Sums that end the process with a signal where they are wrong (jax-ml/jax#39257, #40412), so in one of their own."""
 
 
-@pytest.mark.parametrize(("first", "second"), [("edqn_jax", "jax"), ("jax", "edqn_jax")])
+@pytest.mark.parametrize(("first", "second"), [("edqn_jax", "jax"), *rows_in_whole(("jax", "edqn_jax"))])
 def test_a_users_own_programs_get_right_sums_after_the_import(first, second):
     environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
     program = PROGRAM.format(first=first, second=second)

@@ -175,6 +175,7 @@ def test_a_mixture_was_trained_in_the_sizes_of_its_families(tmp_path: Path) -> N
     assert trained_sizes(dataclasses.replace(ROOMS, world=WorldConfig(name=str(tmp_path / "gone.xml")))) == {}
 
 
+@pytest.mark.whole
 def test_a_random_world_is_checked_by_its_number() -> None:
     found = check_world(ROOMS, "rooms", seed=3)
     assert found.refusal is None and found.survey is None and found.way is not None

@@ -171,6 +171,7 @@ def test_an_observation_of_another_sensor_is_refused_with_a_sentence_that_names_
         flies.act(dataclasses.replace(fitting, sensed=seen))
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_noise_changes_the_form_of_events_and_not_whether_they_fit():
     noisy = dataclasses.replace(CONFIG, events=EventsConfig(leak_rate_hz=0.2))

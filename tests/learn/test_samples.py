@@ -21,6 +21,7 @@ from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import MIRRORED_MOTION, MOTION_SIZE, Observation
 from edqn_jax.sim.task.task import task_of
 from tests.oracles import event_fields
+from tests.support.marks import rows_in_whole
 
 ENVS, LENGTH = 3, 4
 CONFIG = EncoderConfig(replay_size=2 * ENVS * LENGTH, target="sensed", mirror=False)  # of two shards
@@ -80,7 +81,11 @@ def test_what_is_drawn_belongs_together() -> None:
 
 @pytest.mark.parametrize(
     ("architecture", "even", "alone"),
-    [("patches", True, True), ("patches", False, True), ("pooled", True, True), ("pooled", False, False)],
+    [
+        ("patches", True, True),
+        *rows_in_whole(("patches", False, True), ("pooled", True, True)),
+        ("pooled", False, False),
+    ],
 )
 @pytest.mark.slow
 def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -> None:

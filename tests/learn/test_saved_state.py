@@ -22,6 +22,7 @@ def world() -> EnvParams:
     return miniature_world(TINY)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_state_of_several_agents_comes_back_on_another_number_of_devices(world: EnvParams) -> None:
     one, two = (Trainer(TINY, [world] * 2, jax.devices()[:count]) for count in (1, 2))

@@ -14,6 +14,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from edqn_jax.native import all_sum as module
 from edqn_jax.native.all_sum import all_sum
+from tests.support.marks import in_whole
 
 MESH = Mesh(np.asarray(jax.devices()[:2]), ("d",))
 
@@ -56,7 +57,7 @@ def test_one_device_adds_nothing() -> None:
     assert all_sum(x, None, 0.0) is x
 
 
-@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize("late", [0, *in_whole(1)])
 def test_a_device_that_is_late_is_waited_for(late: int) -> None:
     """Twenty sums, each of what the one before came to, with work between them on one device."""
 

@@ -40,11 +40,11 @@ def a_path(scene, start: np.ndarray) -> bool:
 @pytest.mark.parametrize(
     ("shapes", "closed"),
     [
-        pytest.param([], False, id="open"),
+        pytest.param([], False, id="open", marks=pytest.mark.whole),
         pytest.param(enclosure((3.0, 3.0, 3.0)), True, id="closed room"),
         pytest.param(wall(0.6), True, id="too narrow", marks=pytest.mark.whole),
-        pytest.param(wall(0.8), False, id="just wide enough"),
-        pytest.param(wall(1.5), False, id="wide"),
+        pytest.param(wall(0.8), False, id="just wide enough", marks=pytest.mark.whole),
+        pytest.param(wall(1.5), False, id="wide", marks=pytest.mark.whole),
         pytest.param([*wall(1.0), *enclosure((9.0, 2.5, 3.0))[:4]], False, id="door and tunnel"),
     ],
 )

@@ -91,6 +91,7 @@ def test_a_surface_has_no_inside() -> None:
     assert not is_like(drawn, CUT).any() and is_like(drawn[60:140, 60:140], shaded(GREY, UP)).all()
 
 
+@pytest.mark.whole
 def test_a_map_of_a_hall_shows_its_walls_cut_and_its_floor_pale(roofed: Scene) -> None:
     (mesh,) = make_cutaway(roofed, MAP).meshes
     drawn = draw_meshes(MAP, [mesh], np.array([1.0, 0.0]), 0.05, np.array([360, 200]))

@@ -62,6 +62,7 @@ def test_a_validation_is_due_where_a_multiple_is_crossed_once_there_was_learning
     assert is_due(config, Schedule(total=200, scheduled=200, warmup=0, starts=5, vae_training=()), checked, done) is due
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_half_of_the_validation_begins_near_the_start_and_all_of_it_in_random_worlds() -> None:
     few = TrainConfig(validation_missions=16)

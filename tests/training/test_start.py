@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 from typing import Any
 
@@ -26,14 +27,19 @@ from edqn_jax.training.setup import set_up_training
 
 SMALL = edqn_jax.make_config("medium", camera={"width": 16, "height": 8}, agent={"hidden": (8,)})
 BODY = dataclasses.replace(SMALL, camera=dataclasses.replace(SMALL.camera, mount="body"))
-POLICY = Policy(SMALL, fresh_policy(SMALL, 5))
+
+
+@functools.cache
+def small_policy() -> Policy:
+    return Policy(SMALL, fresh_policy(SMALL, 5))
 
 
 def assert_equal_trees(found: Any, wanted: Any) -> None:
     jax.tree.map(np.testing.assert_array_equal, found, wanted)
 
 
-def begin(config: Config, policy: Policy = POLICY) -> Networks:
+def begin(config: Config, policy: Policy | None = None) -> Networks:
+    policy = policy or small_policy()
     fresh = init_networks(config, jax.random.key(0))
     return begin_networks(config, fresh, policy.config, policy.params)
 
@@ -43,9 +49,9 @@ def test_the_networks_are_the_policys_and_their_optimisers_fresh(learner: str) -
     config = dataclasses.replace(SMALL, agent=dataclasses.replace(SMALL.agent, learner=learner))
     found, fresh = begin(config), init_networks(config, jax.random.key(0))
     for params in (found.vae, found.encoder):
-        assert_equal_trees(params, POLICY.params.encoder)
+        assert_equal_trees(params, small_policy().params.encoder)
     for params in (learner_of(config).network(found.agent), learner_of(config).policy(found.agent)):
-        assert_equal_trees(params, POLICY.params.q)
+        assert_equal_trees(params, small_policy().params.q)
     assert_equal_trees((found.vae_optimiser, found.agent.q_optimiser), (fresh.vae_optimiser, fresh.agent.q_optimiser))
 
 
@@ -77,25 +83,25 @@ def test_a_last_move_that_the_policy_did_not_see_changes_no_value_at_first() -> 
         for _ in range(SMALL.agent.history)
     ]
     values = []
-    for actor, q in ((known, POLICY.params.q), (more, learner_of(told).policy(agent))):
-        params, memory = PolicyParams(POLICY.params.encoder, q), actor.init()
+    for actor, q in ((known, small_policy().params.q), (more, learner_of(told).policy(agent))):
+        params, memory = PolicyParams(small_policy().params.encoder, q), actor.init()
         for observation in observations:
             memory = actor.encode(params, memory, observation)
         values.append(network_values(actor.config.agent, q, memory))
     np.testing.assert_allclose(values[1], values[0], rtol=1e-5, atol=1e-5)
-    assert_equal_trees(begin(told, Policy(told, PolicyParams(POLICY.params.encoder, agent.q))).agent.q, agent.q)
+    assert_equal_trees(begin(told, Policy(told, PolicyParams(small_policy().params.encoder, agent.q))).agent.q, agent.q)
 
 
 def test_networks_of_other_shapes_and_learners_that_cannot_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     wide = dataclasses.replace(SMALL, agent=dataclasses.replace(SMALL.agent, hidden=(9,)))
-    for config, policy in ((wide, POLICY), (SMALL, Policy(BODY, fresh_policy(BODY)))):
+    for config, policy in ((wide, small_policy()), (SMALL, Policy(BODY, fresh_policy(BODY)))):
         with pytest.raises(edqn_jax.ConfigError, match="have other shapes than those of the policy"):
             begin(config, policy)
     phases = []
     display = SimpleNamespace(phase=phases.append)
     with (
         pytest.raises(edqn_jax.ConfigError, match="have other shapes"),
-        set_up_training(wide, display=display, start=POLICY),  # type: ignore[arg-type]
+        set_up_training(wide, display=display, start=small_policy()),  # type: ignore[arg-type]
     ):
         pass
     assert not phases  # nothing was prepared or compiled

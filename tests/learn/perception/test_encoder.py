@@ -17,6 +17,7 @@ from edqn_jax.learn.perception.code import Form, kl_divergence
 from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task.observation import MOTION_SIZE
 from tests.oracles import event_fields, pooled_encoder_plain
+from tests.support.marks import in_whole
 from tests.support.moving_boxes import fields
 
 CAMERA = CameraConfig()
@@ -83,7 +84,7 @@ def even_field() -> event_field.EventField:
     ("field", "kind"),
     [
         pytest.param(ragged_field(1), "network", id="ragged-network"),
-        pytest.param(even_field(), "table", id="even-table"),
+        pytest.param(even_field(), "table", id="even-table", marks=pytest.mark.whole),
         pytest.param(ragged_field(1), "table", id="ragged-table", marks=pytest.mark.whole),
         pytest.param(even_field(), "network", id="even-network", marks=pytest.mark.whole),
     ],
@@ -117,7 +118,7 @@ def test_dense_encoder_pools_single_events(kind, field):
 
 
 @pytest.mark.parametrize("form", [Form.EVENTS, Form.PICTURE], ids=["events", "pictures"])
-@pytest.mark.parametrize("kind", ["table", "network"])
+@pytest.mark.parametrize("kind", ["table", *in_whole("network")])
 @pytest.mark.slow
 def test_pixel_features_written_out_give_the_same_codes(kind, form):
     config = dataclasses.replace(CONFIG, pixel_features=kind, features=8, hidden=16, code_size=5)
@@ -221,7 +222,7 @@ def test_the_loss_is_reconstruction_plus_weighted_kl():
     assert float(losses.kl) > 0.0 and float(losses.reconstruction) > 0.0
 
 
-@pytest.mark.parametrize("bandwidth", [0.5, 1.0])
+@pytest.mark.parametrize("bandwidth", [0.5, *in_whole(1.0)])
 @pytest.mark.slow
 def test_the_error_over_waves_is_the_error_over_pixels(bandwidth):
     config = dataclasses.replace(CONFIG, decoder_bandwidth=bandwidth)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from edqn_jax.learn.perception import layers
+from tests.support.marks import in_whole
 
 
 @pytest.mark.parametrize("rows", [(), (3,), (4, 5), (2 * layers.ROWS_OF_A_PART + 6,)])
-@pytest.mark.parametrize("use_bias", [True, False])
+@pytest.mark.parametrize("use_bias", [True, *in_whole(False)])
 def test_a_layer_is_that_of_flax_with_its_gradients(rows: tuple[int, ...], use_bias: bool) -> None:
     keys = jax.random.split(jax.random.key(0), 3)
     x, weight = jax.random.normal(keys[0], (*rows, 7)), jax.random.normal(keys[1], (*rows, 3))

@@ -19,7 +19,7 @@ from edqn_jax.native.products import in_precision
 from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task.observation import MOTION_SIZE
 from tests.oracles import event_fields, patch_encoder_plain
-from tests.support.marks import in_whole
+from tests.support.marks import in_whole, rows_in_whole
 
 SMALL = CameraConfig(width=10, height=6)  # no multiple of a patch's side
 CONFIG = EncoderConfig(code_size=5, patch_layers=(6, 3), joint_layers=(8, 7))
@@ -60,7 +60,8 @@ def single_events(field: event_field.EventField, pairs: int) -> list[patch_encod
 
 
 @pytest.mark.parametrize(
-    ("pairs", "noise", "overlap"), [(1, False, 0), (2, False, 0), (1, True, 0), (2, True, 0), (2, False, 2)]
+    ("pairs", "noise", "overlap"),
+    [(1, True, 0), (2, False, 2), *rows_in_whole((1, False, 0), (2, False, 0), (2, True, 0))],
 )
 @pytest.mark.slow
 def test_dense_codes_are_those_of_single_events(pairs: int, noise: bool, overlap: int) -> None:
@@ -139,11 +140,9 @@ def test_a_picture_is_read_as_one_channel_of_events_is() -> None:
 @pytest.mark.parametrize(
     ("target", "form", "channels"),
     [
-        ("sensed", Form.EVENTS, 2),
-        ("nearness", Form.EVENTS, 1),
         ("both", Form.EVENTS, 3),
-        ("nearness", Form.PICTURE, 1),
         ("both", Form.PICTURE, 2),
+        *rows_in_whole(("sensed", Form.EVENTS, 2), ("nearness", Form.EVENTS, 1), ("nearness", Form.PICTURE, 1)),
     ],
 )
 @pytest.mark.slow
@@ -204,6 +203,7 @@ def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone(pro
     assert with_motion < 0.5 * without, (with_motion, without)
 
 
+@pytest.mark.whole
 def test_the_gradient_of_rounded_products_is_near_that_of_plain_ones() -> None:
     """bfloat16 rounds by up to 2^-9, through six layers there and back, and a ReLU near 0 opens or closes."""
     camera, config = CameraConfig(width=16, height=12), EncoderConfig()

@@ -319,6 +319,7 @@ def test_both_mounts_see_the_same_from_a_level_body(sorts):
     assert rms(one - other) < 0.015
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("mount", ["body", *in_whole("level")])
 @pytest.mark.slow
 def test_any_resolution_and_field_of_view(view, mount):
@@ -330,6 +331,7 @@ def test_any_resolution_and_field_of_view(view, mount):
     assert rms(ours - reference) < 0.03
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_shape_that_is_not_there_is_not_seen():
     config = CameraConfig()

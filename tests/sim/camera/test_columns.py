@@ -41,6 +41,7 @@ def crowd(rng, boxes, cylinders, spheres):
     )
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("count", [10, 40], ids=["more than any capacity", "more than a word holds"])
 @pytest.mark.slow
 def test_columns_with_more_shapes_than_any_capacity_are_drawn_completely(count):
@@ -53,6 +54,7 @@ def test_columns_with_more_shapes_than_any_capacity_are_drawn_completely(count):
     assert np.sqrt(np.mean((seen - plain) ** 2)) < 0.02 and np.abs(seen - plain).max() < 0.25
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_picture_does_not_depend_on_blocks_and_on_how_it_is_mapped(monkeypatch):
     """Two crowded worlds, 64 poses: sorted into blocks, and one shape after another in every column."""

@@ -19,6 +19,7 @@ SIZES = np.array([[6.0, 3.0, 0.4], [6.0, 0.3, 2.0]])
 PLACES = np.array([[10.0, 5.0, 1.0], [10.0, 8.3, 2.6]])
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("mount", ["body", *in_whole("level")])
 def test_the_texture_of_faces_seen_at_a_low_angle_is_averaged_as_that_of_boxes(mount: str, tmp_path: Path) -> None:
     """A floor and a wall, both 12 m long, and an eye close to them."""

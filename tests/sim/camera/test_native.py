@@ -210,7 +210,7 @@ def empty_field(rng: np.random.Generator) -> Scene:
         pytest.param((32, 24), crowd, id="usual"),
         pytest.param((13, 7), crowd, id="no multiple of a block", marks=pytest.mark.whole),
         pytest.param((70, 20), crowd, id="several blocks", marks=pytest.mark.whole),
-        pytest.param((32, 24), crowded_forest, id="several passes"),
+        pytest.param((32, 24), crowded_forest, id="several passes", marks=pytest.mark.whole),
         pytest.param((32, 24), empty_field, id="no upright shapes"),
     ],
 )

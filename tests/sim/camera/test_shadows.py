@@ -20,6 +20,7 @@ from edqn_jax.sim.scene.scene import Scene
 from tests.oracles import camera_plain, mujoco_shadows
 from tests.oracles.mujoco_depth import RayCaster
 from tests.support.drawn_scenes import GROUND, every_kind, free_points, pillar, rotation_of, scene_of
+from tests.support.marks import in_whole
 from tests.support.meshes import CUBE, bracket, hull, mesh_world
 
 SILHOUETTES = 0.02
@@ -56,7 +57,7 @@ def disagreement(config: CameraConfig, scene: Scene, place: NDArray, turn: NDArr
     return float(np.mean((kept < 0.5)[lit] != dark[lit])), float(np.mean(dark[lit])), int(lit.sum())
 
 
-@pytest.mark.parametrize("mount", ["level", "body"])
+@pytest.mark.parametrize("mount", ["level", *in_whole("body")])
 def test_what_is_dark_is_what_a_ray_of_mujoco_towards_the_sun_says(mount: Mount) -> None:
     config, rng, found = dataclasses.replace(CONFIG, mount=mount), np.random.default_rng(5), []
     for _ in range(4):

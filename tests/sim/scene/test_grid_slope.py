@@ -42,6 +42,7 @@ def interpolated(grid: Grid) -> RegularGridInterpolator:
     return RegularGridInterpolator(axes, grid.values.astype(np.float64))
 
 
+@pytest.mark.whole
 @settings(max_examples=8, deadline=None)
 @given(mesh=MESHES, seed=st.integers(0, 1000))
 def test_distances_of_two_places_differ_by_no_more_than_the_slope_says(mesh: trimesh.Trimesh, seed: int) -> None:

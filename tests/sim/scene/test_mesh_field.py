@@ -67,6 +67,7 @@ def test_distances_to_a_mesh_of_many_triangles_are_at_most_a_little_too_small() 
     np.testing.assert_allclose(found, [0.3, 0.5, np.hypot(1.4, 0.1) - 1], atol=0.005)
 
 
+@pytest.mark.whole
 def test_a_thin_mesh_has_small_cells_and_a_large_one_none_below_a_decimetre() -> None:
     assert grid_of_mesh(*hull(CUBE * [0.02, 0.02, 0.3]))[0].cell == 0.05
     assert grid_of_mesh(*hull(CUBE * [6, 0.05, 2]))[0].cell == CELL_M

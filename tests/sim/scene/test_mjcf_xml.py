@@ -193,6 +193,7 @@ PIECES = [
 ]
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_of_files_with_pieces_put_in_mujoco_and_we_read_the_same_ones_alike(tmp_path: Path) -> None:
     drawn, file, read = random.Random(0), tmp_path / "world.xml", 0

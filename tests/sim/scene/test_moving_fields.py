@@ -24,6 +24,7 @@ from edqn_jax.sim.scene.scene import Scene, has_motion, scene_at, stack_scenes, 
 from edqn_jax.sim.scene.shapes import field_rays
 from edqn_jax.sim.scene.shapes.field import SLACK_M
 from tests.oracles.moved_mesh import MovedMesh
+from tests.support.marks import in_whole
 from tests.support.meshes import bracket, mesh_asset
 
 RADIUS = 0.36
@@ -140,7 +141,7 @@ def rays_of_camera() -> np.ndarray:
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("in_c", [True, False])
+@pytest.mark.parametrize("in_c", [True, *in_whole(False)])
 @settings(max_examples=10, deadline=None, phases=PHASES)
 @given(mesh=MESHES, time=st.floats(0.0, 30.0, width=32))
 def test_the_camera_sees_it_where_its_triangles_are(

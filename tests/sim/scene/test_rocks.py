@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import importlib.util
 
+import pytest
+
 from edqn_jax.sim.scene.mjcf import check_scene, load_world
 from tests.support.pages import ROOT
 
 FILE = ROOT / "scenes/examples/rocks.xml"
 
 
+@pytest.mark.whole
 def test_the_boulders_are_those_that_the_script_makes_and_are_convex() -> None:
     spec = importlib.util.spec_from_file_location("make_rocks", ROOT / "scripts/make_rocks.py")
     assert spec is not None and spec.loader is not None

@@ -204,6 +204,7 @@ def test_a_policy_is_flown_with_another_sensor_than_it_was_trained_with():
         with_conditions(Config(), {"events": {"law": "esim"}}, "conditions")
 
 
+@pytest.mark.whole
 def test_a_policy_acts_on_events_with_and_without_noise():
     """Rows of ON and of OFF events are the same channels to an encoder that was trained without noise."""
     noisy = dataclasses.replace(DARK, events=dataclasses.replace(DARK.events, shot_rate_hz=1e-6))

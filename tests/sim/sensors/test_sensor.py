@@ -174,7 +174,7 @@ def world():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["frames", "depth", "ranges"])
+@pytest.mark.parametrize("name", ["depth", *in_whole("frames", "ranges")])
 def test_a_step_shows_what_is_seen_from_where_it_ends(world, name: str) -> None:
     config = config_of(name)
     state, _ = jax.jit(lambda key: env.reset(config, world, key))(jax.random.key(0))

@@ -89,6 +89,7 @@ def test_each_block_is_of_one_world_and_another_key_gives_other_blocks():
         assert np.array_equal(a, b) and not np.array_equal(a, c)
 
 
+@pytest.mark.whole
 def test_where_no_candidate_is_free_of_all_the_one_that_violates_least_is_taken_and_no_number_is_lost():
     pool = random_pool("rooms", world_keys("validation", 1), Moving())
     start, goal = sample_crossing(take_scene(pool, 0), 40, jax.random.key(0))  # there is no place for forty

@@ -41,6 +41,7 @@ from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge_decision
 from edqn_jax.sim.task.reward import configured_reward
 from edqn_jax.sim.worlds import geodesic
 from tests.support.drawn_scenes import GROUND, rotation_of
+from tests.support.marks import in_whole
 from tests.support.small_worlds import box, small_world
 
 CONFIG = Config(env=EnvConfig(reward="sparse", step_reward=-0.25, left_volume_reward=-70.0))
@@ -728,7 +729,7 @@ def test_many_environments_at_once_are_the_same_as_one_by_one(reset, step):
             assert np.mean(np.asarray(wrong)) < 0.01  # a rare event on the threshold
 
 
-@pytest.mark.parametrize("law", ["paper", "esim"])
+@pytest.mark.parametrize("law", ["paper", *in_whole("esim")])
 @pytest.mark.slow
 def test_no_key_is_used_twice_and_no_rank_is_promoted(world, law):
     # Leak checks do not get past MJX. Tracing is enough: both checks are made there.

@@ -152,6 +152,7 @@ def test_a_drone_that_has_ended_is_neither_hit_nor_seen_and_its_group_is_reset_w
     assert np.allclose(states[arrived + 1].drone.position, world.missions.start)
 
 
+@pytest.mark.whole
 def test_all_of_a_group_are_reset_to_the_missions_of_one_block_in_their_order():
     ends = [((10 + 2 * i, 5 + 7 * k, 6), (50, 5 + 7 * k, 6)) for k in range(5) for i in range(3)]
     config, world = configured(3, sensor="blind"), world_of(*ends)
@@ -184,6 +185,7 @@ def flights_of_groups(draw):
     return path.astype(np.float32), flies, until.astype(np.float32)
 
 
+@pytest.mark.whole
 @settings(max_examples=150, deadline=None)
 @given(flights_of_groups())
 def test_hits_are_those_of_a_walk_in_small_steps(given):

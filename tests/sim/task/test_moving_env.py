@@ -108,7 +108,7 @@ def test_events_are_where_the_obstacles_edges_are(hovered):
     assert int(states[4].decision) == 4
 
 
-@pytest.mark.parametrize("name", ["frame-pair", "ranges", *in_whole("frames", "depth")])
+@pytest.mark.parametrize("name", ["ranges", *in_whole("frame-pair", "frames", "depth")])
 def test_every_frame_sees_the_world_at_its_own_time(name):
     config, world = configured(name), world_of(pillar(sliding()))
     _, first, steps = fly(world, [HOVER] * 3, config)
@@ -354,6 +354,7 @@ def test_a_reward_is_told_the_clearance_at_the_decisions_end():
     assert told
 
 
+@pytest.mark.whole
 def test_many_environments_at_different_times_are_as_one_by_one():
     world = world_of(pillar(sliding()))
     states, _, steps = fly(world, [HOVER] * 6)

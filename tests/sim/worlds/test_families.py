@@ -182,6 +182,7 @@ def test_hard_worlds_are_the_same_as_mjcf(pools, family, tmp_path):
     np.testing.assert_allclose(ours, theirs, atol=2e-5)  # written with some digits
 
 
+@pytest.mark.whole
 def test_a_world_without_a_way_is_drawn_again(monkeypatch):
     def draw(key):
         """Rooms with a wall all across, for two keys of three."""
@@ -247,6 +248,7 @@ def test_an_unknown_family_names_the_nearest_or_those_there_are():
         random_scene("xyz", world_key("test", 0))
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["sparse", *in_whole(*HARD)])
 def test_worlds_and_missions_reuse_no_key_and_promote_no_rank(family):

@@ -20,6 +20,7 @@ from edqn_jax.sim.scene.scene import Scene, scene_shapes, stack_scenes, take_sce
 from edqn_jax.sim.scene.surface import CONTRAST, KIND, PATTERNS, PHASES, SHARES
 from edqn_jax.sim.worlds.families import random_pool, world_keys, worlds_of
 from edqn_jax.sim.worlds.looks import APART, BRIGHTEST, TRAINED, patterns_of, with_looks
+from tests.support.marks import in_whole
 
 OWN = [look for look in LOOKS if look != "plaid"]
 
@@ -51,7 +52,7 @@ def test_plaid_worlds_have_no_look_and_others_are_the_same_bodies(drawn: Scene) 
         np.testing.assert_array_equal(getattr(plain, name), getattr(drawn, name))
 
 
-@pytest.mark.parametrize("pattern", OWN)
+@pytest.mark.parametrize("pattern", [*OWN[:3], *in_whole(*OWN[3:])])
 def test_a_surface_reflects_no_more_than_it_gets_and_has_periods_within_the_limits(pattern: str) -> None:
     pool = pool_of(pattern)
     numbers, albedo = np.asarray(pool.boxes.surface.numbers), np.asarray(pool.boxes.albedo)
@@ -115,6 +116,7 @@ def test_shares_of_drawn_worlds_light_and_their_keys(drawn: Scene) -> None:
     jax.tree.map(np.testing.assert_array_equal, drawn, few)
 
 
+@pytest.mark.whole
 def test_surfaces_survive_stacking_and_padding(drawn: Scene) -> None:
     one, other = take_scene(drawn, 0), take_scene(pool_of("drawn", "dense", 2), 1)
     stacked = stack_scenes([one, other])
@@ -127,6 +129,7 @@ def test_surfaces_survive_stacking_and_padding(drawn: Scene) -> None:
     assert pools[0].cylinders.surface.numbers.shape[1] == pools[1].cylinders.radius.shape[1] > 0
 
 
+@pytest.mark.whole
 def test_shapes_that_move_have_looks() -> None:
     assert pool_of("drawn", "moving", 4).boxes.surface is not None
 

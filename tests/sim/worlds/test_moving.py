@@ -23,6 +23,7 @@ from edqn_jax.sim.worlds import canyon, families, forest
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from edqn_jax.sim.worlds.free_points import CLEARANCE, EARLY_S
 from edqn_jax.sim.worlds.moving import MOVING_SHARE, Moving
+from tests.support.marks import in_whole
 from tests.support.meshes import bracket
 from tests.support.registries import keep_as_they_are
 
@@ -120,7 +121,7 @@ def _nearest(scene, point, times):
     return jnp.min(jax.vmap(lambda t: signed_distance(scene_at(unthrown, t), point))(times))
 
 
-@pytest.mark.parametrize("name", ["moving", "everything"])
+@pytest.mark.parametrize("name", ["moving", *in_whole("everything")])
 def test_who_hovers_at_a_start_is_left_alone_for_two_seconds(pools, name):
     times = jnp.arange(0, EARLY_S + 1e-6, 0.02)
     pool = pools[name]
@@ -171,6 +172,7 @@ def test_what_belongs_together_moves_together(family, bodies):
             np.testing.assert_allclose(each, np.broadcast_to(each[0], np.shape(each)), atol=1e-4)
 
 
+@pytest.mark.whole
 def test_meshes_of_a_family_of_ones_own_move(monkeypatch: pytest.MonkeyPatch) -> None:
     mesh = Geom("mesh", np.zeros(3), np.eye(3), np.zeros(3), np.full(3, 0.5), mesh=bracket())
     shapes = [dataclasses.replace(read_shape(mesh), position=place) for place in ([10.0, 4, 4], [20.0, 14, 4])]
@@ -258,6 +260,7 @@ def test_moving_worlds_reuse_no_key_and_promote_no_rank(family):
         jax.jit(lambda pool: scene_at(take_scene(pool, 0), jnp.float32(1.0)))(pool)
 
 
+@pytest.mark.whole
 def test_environments_and_evaluations_fly_in_what_the_configuration_says():
     moving = {"moving_share": 1.0, "moving_speed_m_s": 2.0, "balls": 2}
     config = make_config("medium", world=moving, surface={"pattern": "plaid"})
