@@ -41,7 +41,8 @@ def test_runs_come_back_as_they_were_added_and_their_medians_are_of_one_processo
         added[number]["time"] = f"{day} 11:00"
     assert hours.summary(added, added[0]) == (
         "Median of 3 runs on 3 days on this processor, with minimum and maximum: "
-        "20,000 decisions/s (10,000 to 31,000), 0.250 of C MuJoCo's rate (0.200 to 0.310), 9.5 s of compiling (8.0 to 12.0)."
+        "20,000 decisions/s (10,000 to 31,000), 0.250 of C MuJoCo's rate (0.200 to 0.310), "
+        "9.5 s of compiling (8.0 to 12.0)."
     )
     assert "1 run on 1 day on" in hours.summary(added, added[2])
 
