@@ -188,7 +188,7 @@ def render_depth(config: CameraConfig, scene: Scene, position: Array, rotation: 
 
 def _pictures_natively(platform: str, config: CameraConfig, _: columns.Finish, *image: Any) -> Array | None:
     """Returns brightness [M, H, W] by the library in C or CUDA, blended as by `blend_layers`; None if unsupported."""
-    can = native.can_render(image[0], platform) and not config.shadows
+    can = native.can_render(image[0], platform, config.shadows)
     return native.render_luma(config, *image) if can else None
 
 

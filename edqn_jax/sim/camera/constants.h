@@ -10,6 +10,7 @@
 #define LEVEL_FACE 1e9f
 #define DEPTH_OF_LAYERS 3
 #define MOST_PLANES 8             /* native.py */
+#define CLEAR_M 0.01f             /* shadows.py */
 #define EDGE 0.015625f            /* surfaces.py, as the next */
 #define OVERTONE 0.5f
 #define SURFACE_NUMBERS 22        /* scene/surface.py, as the rest */

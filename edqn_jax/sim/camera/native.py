@@ -29,7 +29,7 @@ from edqn_jax.sim.scene.surface import SURFACE_NUMBERS
 SOURCES = {name: Path(__file__).with_name(f"pictures.{name}") for name in ("h", "c", "cu")}
 HEADERS = (
     SOURCES["h"],
-    *(Path(__file__).with_name(f"{name}.h") for name in ("constants", "patterns", "tilted", "fields")),
+    *(Path(__file__).with_name(f"{name}.h") for name in ("constants", "patterns", "shadows", "tilted", "fields")),
     *field_rays.HEADERS,
 )
 
@@ -42,7 +42,7 @@ OPERANDS = {
 """Kinds of shape that the library draws, and what it reads of each. A scene with room for any other is drawn by JAX."""
 
 FIELDS = "fields"
-"""The kind that C draws as well, after the others (`fields.h`), and CUDA does not."""
+"""The kind that C draws as well, after the others (`fields.h`), where no shadows are cast, and CUDA does not."""
 
 FIELD_OPERANDS = ("position", "rotation", "half", "grid", "albedo")
 """What C reads of each field, beside their grids and surfaces."""
@@ -56,17 +56,23 @@ NOWHERE = 1e29
 """Depths beyond this, in metres, are those of rays that meet nothing."""
 
 
-def can_render(scene: Scene, platform: str) -> bool:
-    """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing."""
+def can_render(scene: Scene, platform: str, shadows: bool = False) -> bool:
+    """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing.
+
+    Args:
+        scene: with any leading axis.
+        platform: the library's.
+        shadows: whether shadows are cast.
+    """
     leaves = [*_shapes(scene), *_leaves(scene.others.get(FIELDS), FIELD_OPERANDS)]
-    known = not kinds_for_jax(scene, platform) and all(leaf.dtype == jnp.float32 for leaf in leaves)
+    known = not kinds_for_jax(scene, platform, shadows) and all(leaf.dtype == jnp.float32 for leaf in leaves)
     return known and is_available(platform)
 
 
-def kinds_for_jax(scene: Scene, platform: str = "cpu") -> list[str]:
+def kinds_for_jax(scene: Scene, platform: str = "cpu", shadows: bool = False) -> list[str]:
     """Returns the kinds of shape because of which JAX draws a scene, or a pool; none if C, or CUDA, can draw it."""
     counts = {kind: shapes.position.shape[-2] for kind, shapes in scene.shapes().items()}
-    drawn = (*OPERANDS, FIELDS) if platform == "cpu" else OPERANDS
+    drawn = (*OPERANDS, FIELDS) if platform == "cpu" and not shadows else OPERANDS
     most = dict.fromkeys(drawn, math.inf) | {"planes": MOST_PLANES}
     return [kind for kind, count in counts.items() if count > most.get(kind, 0)]
 
@@ -97,8 +103,8 @@ def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Ar
     waves = np.array(
         [[*np.divide(w.direction, config.texture_period_m * w.octave), w.weight] for w in WAVES], np.float32
     )
-    rays = config.mount == "body", config.samples_across, config.samples_down
-    constants = np.array([raycast.pitch_of(config), config.texture_contrast, *rays], np.float32)
+    drawn = config.mount == "body", config.samples_across, config.samples_down, config.shadows
+    constants = np.array([raycast.pitch_of(config), config.texture_contrast, *drawn], np.float32)
     shapes, fields = _shapes(scene), _fields(scene)
     origin, rotation, *weights = frames
     looks = [_daylight(config, scene), *(_surfaces(getattr(scene, kind)) for kind in OPERANDS)] if weights else []

@@ -83,7 +83,8 @@ typedef struct {
   Sides* sides;
   Extent* spheres;
   Layers* layers;
-  Pattern* patterns; /* by shape */
+  Pattern* patterns; /* by shape, as the next */
+  Caster* casters;
   Tilted* tilted;
   float* heights; /* of the tilted ones' faces */
   int *covering, *found; /* shapes that cover each column, in order, and how many */
@@ -102,12 +103,13 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->u = malloc(sizeof(float) * (size_t)(w->stride + 2 * rows));
   w->spheres = malloc(sizeof(Extent) * (size_t)(s->spheres + 1));
   w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + s->fields + 1));
+  w->casters = malloc(sizeof(Caster) * (size_t)(uprights + s->spheres + 1));
   w->tilted = malloc(sizeof(Tilted) * (size_t)(uprights + 1));
   w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)(uprights * HEIGHTS(c->across) * w->stride) + 1 : 1));
   w->most = uprights + 1;
   w->found = malloc(sizeof(int) * (size_t)c->width * (size_t)(w->most + 1));
   if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres) return 0;
-  if (!w->patterns || !w->tilted || !w->heights || !prepare_fields(c, rows, s->fields, &w->fields)) return 0;
+  if (!w->patterns || !w->casters || !w->tilted || !w->heights || !prepare_fields(c, rows, s->fields, &w->fields)) return 0;
   w->covering = w->found + c->width;
   w->v = w->u + w->stride, w->nearest = w->v + rows;
   /* What lies beyond the image repeats its edge, so that all numbers are finite. */
@@ -118,14 +120,14 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
 
 static void release(Work* w) {
   free(w->numbers), free(w->sides), free(w->layers), free(w->u), free(w->found), free(w->spheres);
-  free(w->patterns), free(w->tilted), free(w->heights), free(w->fields.ray[0]);
+  free(w->patterns), free(w->casters), free(w->tilted), free(w->heights), free(w->fields.ray[0]);
 }
 
 /* Writes a column of blended layers. */
 static void finish(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves, Work* w,
                    const float* ahead, float* column) {
   for (int b = 0; b < rounded_up(c->height) / LANES; ++b) {
-    const Lanes behind = blend(c, s, planes, e, waves, w->patterns, ahead, load(w->v + b * LANES), &w->layers[b]);
+    const Lanes behind = blend(c, s, planes, e, waves, w->patterns, w->casters, ahead, load(w->v + b * LANES), &w->layers[b]);
     for (int l = 0; l < LANES && b * LANES + l < c->height; ++l) column[(b * LANES + l) * c->width] = behind[l];
   }
 }
@@ -180,6 +182,10 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
   planes_of(c, s, e, planes);
   light_planes(c, s, e, planes);
   for (int n = 0; n < s->boxes + s->cylinders + s->spheres + s->planes + s->fields; ++n) w->patterns[n].kind = UNKNOWN;
+  if (c->shadows) {
+    const Across across = across_sun(c);
+    for (int n = 0; n < s->boxes + s->cylinders + s->spheres; ++n) w->casters[n] = caster_of(s, &across, n);
+  }
   draw_fields(c, e, &w->fields, rounded_up(c->height));
   if (c->tilted) {
     draw_tilted(c, s, e, w, waves, planes, picture);

@@ -48,6 +48,7 @@ FN Lanes nearest_whole(Lanes x) { return (x + 12582912.0f) - 12582912.0f; }
 
 typedef struct {
   int height, width, waves, tilted, across, down; /* across, down: rays a pixel, of a tilted image */
+  int shadows;                                    /* whether the sun's light is kept from what is behind a shape */
   float pitch, contrast, ambient;
   const float *sun, *sky; /* [3] each */
   const float *u, *v;     /* [C], [H] middles of pixels in the image plane */
@@ -360,6 +361,13 @@ FN void insert_sphere(const Camera* c, const Shapes* s, const Eye* e, int n, con
   insert(layers, added);
 }
 
+/* How an upright shape is turned about its axis. */
+typedef struct {
+  float cos, sin;
+} Turn;
+
+#include "shadows.h"
+
 /* ------------------------------------------------------------------------------------------------------- texture */
 
 #define MOST_WAVES 8
@@ -504,9 +512,9 @@ FN void surfaces(const Camera* c, const Shapes* s, const Eye* e, Pattern* known,
   }
 }
 
-/* Blends the layers of LANES rows over planes and the sky. */
+/* Blends the layers of LANES rows over planes and the sky. `casters`: what casts shadows, or null. */
 FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves,
-               Pattern* known, const float* ahead, Lanes high, const Layers* layers) {
+               Pattern* known, const Caster* casters, const float* ahead, Lanes high, const Layers* layers) {
   const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
   int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) if (k < used && !hidden)
@@ -533,12 +541,26 @@ FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye*
   else
     textures(c, waves, ahead, high, at, wanted, factor);
 
+  Lanes value[DEPTH_OF_LAYERS];
+  UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) {
+    const Layer* layer = &layers->layer[k];
+    value[k] = k < visible ? layer->value : lanes(0);
+    if (k < visible && c->shadows)
+      value[k] = shaded(c, s, e, casters, ahead, high, at[k].depth,
+                        pick(layer->closeness > 0, layer->shape, lanes(-1)), layer->coverage, value[k]);
+  }
+  if (c->shadows && wanted >> DEPTH_OF_LAYERS & 1) {
+    const float others = (float)(s->boxes + s->cylinders + s->spheres);
+    shown = shaded(c, s, e, casters, ahead, high, at[DEPTH_OF_LAYERS].depth,
+                   pick((share > 0) & (plane >= 0), plane + others, lanes(-1)), lanes(1), shown);
+  }
+
   Lanes behind = lanes(hidden ? 0 : e->sky);
   if (wanted >> DEPTH_OF_LAYERS & 1) behind += share * (shown * factor[DEPTH_OF_LAYERS] - behind);
   UNROLLED for (int k = DEPTH_OF_LAYERS - 1; k >= 0; --k) {
     if (k >= visible) continue;
     const Layer* layer = &layers->layer[k];
-    behind += pick(layer->closeness > 0, layer->value * factor[k] - layer->coverage * behind, lanes(0));
+    behind += pick(layer->closeness > 0, value[k] * factor[k] - layer->coverage * behind, lanes(0));
   }
   return behind;
 }
@@ -564,11 +586,6 @@ FN Lanes nearer_upright(Level level, Lanes from, Lanes to, Lanes per_z, Lanes ne
   const Lanes enter = greater(from, at - reach), leave = lesser(to, at + reach);
   return pick((enter < leave) & (enter > 0) & (enter < nearest), enter, nearest);
 }
-
-/* How an upright shape is turned about its axis. */
-typedef struct {
-  float cos, sin;
-} Turn;
 
 FN Turn turn_of(const Shapes* s, int n) {
   const Turn none = {1, 0};
@@ -666,6 +683,7 @@ FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, E
   c->height = b->height, c->width = b->width, c->waves = b->waves;
   const float* light = of[LIGHT];
   c->tilted = k[2] != 0, c->pitch = k[0], c->contrast = k[1], c->across = (int)k[3], c->down = (int)k[4];
+  c->shadows = k[5] != 0;
   if (light) c->ambient = light[0], c->sun = light + 1, c->sky = light + 4;
   c->u = of[U], c->v = of[V], c->wave = of[WAVES];
   s->boxes = b->boxes, s->cylinders = b->cylinders, s->spheres = b->spheres, s->planes = b->planes;

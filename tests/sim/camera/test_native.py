@@ -17,7 +17,7 @@ import pytest
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.native import build
-from edqn_jax.sim.camera import camera, columns, coverage, native, surfaces
+from edqn_jax.sim.camera import camera, columns, coverage, native, shadows, surfaces
 from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
 from edqn_jax.sim.scene import surface
 from edqn_jax.sim.scene.scene import PARKED, Scene, stack_scenes, take_scene, with_drones, with_equal_capacities
@@ -77,6 +77,7 @@ def test_constants_are_the_same_in_c_and_in_python() -> None:
     places = {
         **dict.fromkeys(("NEAR_M", "FAR_U", "LEVEL_FACE", "DEPTH_OF_LAYERS"), coverage),
         **dict.fromkeys(("EDGE", "OVERTONE"), surfaces),
+        "CLEAR_M": shadows,
         **dict.fromkeys(("SURFACE_NUMBERS", "KIND", "CONTRAST", "SHARES", "PHASES"), surface),
         **{"TINY": kind, "HORIZON_M": plane, "MOST_PLANES": native},
     }
@@ -126,6 +127,21 @@ def test_c_draws_every_pattern_as_jax_does() -> None:
     rng = np.random.default_rng(6)
     if native.is_available("cpu"):
         agree(CONFIG, *patterned_frames(rng), ties=TIES)
+
+
+@pytest.mark.parametrize("mount", ["level", *in_whole("body")])
+def test_c_draws_shadows_as_jax_does(mount: Literal["level", "body"]) -> None:
+    rng = np.random.default_rng(9)
+    config = dataclasses.replace(CONFIG, shadows=True, mount=mount, sun_elevation_deg=30.0)
+    if not native.is_available("cpu"):
+        return
+    scene, origin, rotation = frames([crowd(rng) for _ in range(4)], 24, seed=10)
+    if mount == "body":
+        rotation = tilted_poses(rng, 24)
+    # Edges of shadows are whole pixels, which rounding may move by one.
+    agree(config, scene, origin, rotation, ties=TIES)
+    sunny = drawn(dataclasses.replace(config, shadows=False), scene, origin, rotation)[0]
+    assert np.mean(sunny - drawn(config, scene, origin, rotation)[0] > 0.1) > 0.02  # some of it is in the dark
 
 
 FAMILIES = ("rooms", "forest", "canyon", "dense")
@@ -269,6 +285,39 @@ def test_the_kernels_of_gpus_draw_every_pattern(kernels: bool, monkeypatch: pyte
     monkeypatch.setattr(native, "_call", lambda target, *given: call(f"emulated_{target}", *given))
     if kernels:
         agree(CONFIG, *patterned_frames(np.random.default_rng(8)), ties=TIES)
+
+
+@pytest.mark.parametrize("mount", ["level", *in_whole("body")])
+def test_the_kernels_of_gpus_draw_shadows_as_c_does(
+    kernels: bool, monkeypatch: pytest.MonkeyPatch, mount: Literal["level", "body"]
+) -> None:
+    if not (kernels and native.is_available("cpu")):
+        return
+    config = dataclasses.replace(CONFIG, shadows=True, mount=mount, sun_elevation_deg=30.0)
+    rng = np.random.default_rng(11)
+    scene, origin, rotation = frames([crowd(rng), empty_field(rng)], 32, seed=12)
+    if mount == "body":
+        rotation = tilted_poses(rng, 32)
+    weights = jnp.broadcast_to(jnp.asarray(LUMA_WEIGHTS), origin.shape)
+    in_one, _ = in_c(native._call, config, scene, origin, rotation, weights)
+    call = native._call
+    monkeypatch.setattr(native, "_call", lambda target, *given: call(f"emulated_{target}", *given))
+    in_other, _ = in_c(native._call, config, scene, origin, rotation, weights)
+    assert np.isfinite(in_one).any()
+    assert np.mean(~np.isclose(in_one, in_other, rtol=1e-4, atol=1e-4)) < TIES
+
+
+def test_a_ceiling_keeps_the_sun_out_in_c_too() -> None:
+    low, down = jnp.array([0.0, 0.0, 9.0]), jnp.array([0.0, 0.0, -1.0])
+    hall = scene_of(GROUND, dataclasses.replace(GROUND, position=low, normal=down), box(30, 30, 2, 2, 3, 2, 1))
+    config = dataclasses.replace(CONFIG, texture_contrast=0.0)
+    place, turn = jnp.array([22.0, 28.0, 3.0]), jnp.asarray(rotation_of(0.0, 0.0, 0.3), jnp.float32)
+    draw = jax.jit(camera.render_luma, static_argnums=0)
+    # All that is seen has the ambient light alone; sky there is none.
+    inside = draw(dataclasses.replace(config, shadows=True), hall, place, turn)
+    np.testing.assert_allclose(
+        inside, config.ambient * draw(dataclasses.replace(config, ambient=1.0), hall, place, turn), atol=1e-6
+    )
 
 
 def test_a_world_with_other_shapes_is_drawn_by_jax() -> None:
