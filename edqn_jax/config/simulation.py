@@ -136,8 +136,7 @@ class CameraConfig:
     sun_elevation_deg: Annotated[float, between(0, 90)] = 50.0
     """Height of the sun over the horizon, degrees."""
     shadows: bool = False
-    """Whether shapes cast shadows: what the sun does not reach has the ambient light alone. Pictures are then drawn by
-    JAX, not by C or CUDA."""
+    """Whether shapes cast shadows: what the sun does not reach has the ambient light alone."""
     sky_rgb: Annotated[tuple[float, float, float], SHARES] = (0.62, 0.74, 0.9)
     """Brightness of the sky."""
 

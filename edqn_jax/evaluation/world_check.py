@@ -252,7 +252,7 @@ def trained_sizes(config: Config) -> dict[str, Point]:
 
 def estimate_cost(config: Config, scene: Scene) -> Cost:
     """Returns what a world will take of time and memory."""
-    by_jax = kinds_for_jax(scene)
+    by_jax = kinds_for_jax(scene, shadows=config.camera.shadows)
     pixels = config.camera.width * config.camera.height
     counts = {kind: shapes.position.shape[-2] for kind, shapes in scene.shapes().items()}
     rows = dict.fromkeys(counts, "jax" if by_jax else "c")
@@ -271,7 +271,7 @@ def estimate_cost(config: Config, scene: Scene) -> Cost:
     label_us = _FIELDS_AGAIN * of_kind.get(FIELDS, 0.0) * size
     return Cost(
         drawn_by_jax=by_jax,
-        drawn_by_jax_on_gpus=kinds_for_jax(scene, "cuda"),
+        drawn_by_jax_on_gpus=kinds_for_jax(scene, "cuda", config.camera.shadows),
         picture_us=picture_us,
         decisions_per_s=1e6 / (len(config.events.frame_times_s) * picture_us + label_us + _REST_US),
         world_bytes=world + grids,
