@@ -195,7 +195,7 @@ class KeptFunction(Generic[Returned]):
         self._static, self._signature = static_argnums, inspect.signature(function)
         self._function, self._traced = function, jax.jit(function, static_argnums=static_argnums)
         self._compiled: dict[Any, jax.stages.Compiled] = {}
-        self._one_at_a_time = threading.Lock()
+        self._compiling: dict[Any, threading.Lock] = {}
 
     def __call__(self, *args: Any, **kwargs: Any) -> Returned:
         bound = self._signature.bind(*args, **kwargs)
@@ -213,7 +213,8 @@ class KeptFunction(Generic[Returned]):
         return compiled(*given)
 
     def _compile(self, told_apart: Any, static: Any, given: Any, args: Any) -> jax.stages.Compiled:
-        with self._one_at_a_time:
+        # A program is compiled once, and several are at once.
+        with self._compiling.setdefault(told_apart, threading.Lock()):
             if told_apart not in self._compiled:
                 place = place_of(self._function.__name__.strip("_"), (self.__module__, self._static, static), given)
                 function = jax.jit(named(self._function, place.name), static_argnums=self._static)
