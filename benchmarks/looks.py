@@ -21,6 +21,7 @@ from typing import Any
 
 import jax
 
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.config.simulation import LOOKS
 from edqn_jax.evaluation.evaluate import evaluate_look
 from edqn_jax.runs.policies import load_policy
@@ -53,7 +54,8 @@ def measure(args: argparse.Namespace, show: Callable[[str], None] = print) -> di
     policy = load_policy(args.policy)
     show(HEAD)
     looks = []
-    for look in args.looks:
+    for number, look in enumerate(args.looks):
+        show_phase("flying under each look", number, len(args.looks))
         flown = evaluate_look(policy, args.world, look, missions=args.missions, seed=args.seed, exact=args.exact)
         looks.append({"pattern": look, **flown.figures})
         show(row(looks[-1]))

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from edqn_jax.cli.process.status import open_status
+from edqn_jax.cli.process.status import open_status, show_phase
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.files import check_can_write
@@ -55,7 +55,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
 
     def parse(self, words: Sequence[str] | None) -> argparse.Namespace:
-        """Returns the options.
+        """Returns the options, after which the clock shows that the benchmark measures.
 
         Raises:
             ConfigError: if the file of `--json` or `--figure` cannot be written.
@@ -64,6 +64,7 @@ class Parser(argparse.ArgumentParser):
         for name in ("json", "figure"):
             if getattr(args, name, None) is not None:
                 check_can_write(getattr(args, name))
+        show_phase("measuring")
         return args
 
 
