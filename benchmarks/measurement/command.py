@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from edqn_jax.cli.process.status import open_status, show_phase
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.files import check_can_write
 
@@ -78,6 +78,8 @@ def at_least_one(text: str) -> int:
 def in_a_sentence(main: Callable[..., int]) -> Callable[..., int]:
     """Returns a `main` that prints what is wrong with its input, or which package is missing, and returns 2.
 
+    What a check finds wrong is printed as well, and 1 returned.
+
     The clock of this process, if it runs a benchmark, ends with it.
     """
 
@@ -89,6 +91,9 @@ def in_a_sentence(main: Callable[..., int]) -> Callable[..., int]:
         except (ConfigError, MissingPackageError) as error:
             print(error, file=sys.stderr)
             return 2
+        except CheckError as error:
+            print(error, file=sys.stderr)
+            return 1
 
     return command
 

@@ -58,9 +58,11 @@ def export_command(args: ExportArgs) -> None:
     from edqn_jax.runs.policies import load_policy, policy_digest
 
     exported = export_policy(load_policy(args.run), args.out, checks=args.checks, digest=policy_digest(args.run))
+    compared = exported.checks - exported.on_edges
+    left_out = f" ({exported.on_edges} more, with counts at the edge of being rounded otherwise, were left out)"
     ties = f", {exported.ties} of them ties" if exported.ties else ""
     print(
-        f"'{exported.file}' has {exported.file.stat().st_size / 1e6:.1f} MB; on {exported.checks:,} random inputs it "
-        f"chooses JAX's moves{ties}, and no value differs by more than {exported.largest_difference:.1e} of the "
-        f"largest; '{exported.runner}' flies it with NumPy and onnxruntime",
+        f"'{exported.file}' has {exported.file.stat().st_size / 1e6:.1f} MB; on {compared:,} random inputs"
+        f"{left_out if exported.on_edges else ''} it chooses JAX's moves{ties}, and no value differs by more than "
+        f"{exported.largest_difference:.1e} of the largest; '{exported.runner}' flies it with NumPy and onnxruntime",
     )
