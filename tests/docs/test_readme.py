@@ -40,7 +40,14 @@ def test_the_two_commands_are_the_promised_ones() -> None:
     assert "\n.venv/bin/pip install -e '.[test]' && .venv/bin/pytest\n" in README
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))], ids=lambda p: p.stem)
+CARDS = sorted((ROOT / "edqn_jax/policies").glob("*/README.md"))
+
+
+@pytest.mark.parametrize(
+    "page",
+    [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), *CARDS],
+    ids=lambda p: f"{p.parent.name}-{p.stem}",
+)
 def test_relative_links_lead_to_files(page: Path) -> None:
     links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]

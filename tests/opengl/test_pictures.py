@@ -139,7 +139,7 @@ def test_a_camera_that_cannot_draw_is_one_sentence(monkeypatch):
         mujoco_luma("plain")
 
 
-def test_one_mission_with_nothing_of_ours(tmp_path: Path):
+def test_one_mission_in_mujocos_picture_and_rotorpys_flight(tmp_path: Path):
     file = tmp_path / "cell.json"
     words = ["--world", "medium", "--look", "plain", "--flight", "rotorpy", "--missions", "1", "--json", str(file)]
     assert transfer.main(words) == 0
