@@ -70,7 +70,7 @@ def images(config: CameraConfig, natively: bool, scene: Scene, place: Any, turn:
 def drawn(config: CameraConfig, in_c: bool, scene: Scene, seed: int) -> list[np.ndarray]:
     with pytest.MonkeyPatch.context() as patch:  # while the program is traced
         if not in_c:
-            patch.setattr(native, "can_render", lambda scene, platform: False)
+            patch.setattr(native, "can_render", lambda *_: False)
         return [np.asarray(image) for image in images(config, in_c, scene, *poses(scene, seed))]
 
 
@@ -86,6 +86,7 @@ def agree(config: CameraConfig, scene: Scene, seed: int) -> None:
 @given(seed=st.integers(0, 2**16))
 def test_c_draws_fields_among_other_shapes_as_jax_does(world: Scene, mount: Any, seed: int) -> None:
     assert native.can_render(world, "cpu") is native.is_available("cpu") and not native.can_render(world, "cuda")
+    assert not native.can_render(world, "cpu", shadows=True)
     agree(CameraConfig(mount=mount), world, seed)
 
 
@@ -105,7 +106,7 @@ def test_a_pose_that_is_not_finite_gives_a_picture_of_nan(
     place = place.at[jnp.arange(3), jnp.arange(3)].set(jnp.array([jnp.nan, jnp.inf, jnp.nan]))
     turn = turn.at[3, 0, 0].set(jnp.nan).at[4, 1, 0].set(jnp.inf)
     if not in_c:
-        monkeypatch.setattr(native, "can_render", lambda scene, platform: False)
+        monkeypatch.setattr(native, "can_render", lambda *_: False)
     picture, _ = images(CameraConfig(mount=mount), in_c, world, place, turn)
     assert np.isnan(picture[:5]).all() and np.isfinite(picture[5:]).all()
 
