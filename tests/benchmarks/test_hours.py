@@ -9,6 +9,7 @@ import pytest
 import throughput
 from edqn_jax.errors import ConfigError
 from measurement import hours
+from tests.support.pages import ROOT
 
 SEEN = {"cores_busy_with_others": None, "steal": 0.0123, "product_flops": 2e11}
 
@@ -45,6 +46,12 @@ def test_runs_come_back_as_they_were_added_and_their_medians_are_of_one_processo
         "9.5 s of compiling (8.0 to 12.0)."
     )
     assert "1 run on 1 day on" in hours.summary(added, added[2])
+
+
+def test_the_page_says_what_the_table_says() -> None:
+    rows = hours.read(ROOT / "benchmarks/hours.tsv")
+    page = (ROOT / "docs/performance.md").read_text(encoding="utf-8")
+    assert f"> {hours.summary(rows, rows[-1])}\n" in page
 
 
 @pytest.mark.parametrize("text", ["a,b\n", "\t".join(hours.FIELDS) + "\nshort\trow\n"])
