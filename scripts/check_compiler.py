@@ -182,7 +182,7 @@ def _decide(policy: Any, inputs: list[np.ndarray], options: dict[str, Any]) -> T
 
 
 def _exactly(policy: Any, inputs: list[np.ndarray]) -> Tree:
-    return onnx_export._values_by_jax(policy, [inputs], np.float64)
+    return onnx_export._by_jax(policy, np.float64)([inputs])
 
 
 def _policy_inputs(config: Config, count: int) -> list[np.ndarray]:
