@@ -29,10 +29,9 @@ from jax.sharding import Mesh
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
-from edqn_jax.devices.hardware import count_cores, describe_processor
+from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.files import check_can_write
 from edqn_jax.learn.trainer import AXIS
 from edqn_jax.runs.provenance import describe_workload
 from measurement import hours, json_report
@@ -57,7 +56,8 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     """Returns the parsed arguments, and the configuration that is timed.
 
     Raises:
-        ConfigError: if the options after -- are invalid, or a file cannot be written or is no table of runs.
+        ConfigError: if the options after -- are invalid, a file cannot be written or is no table of runs, or a
+            short turn would be added to one.
     """
     words, flags = split(argv)
     parser = Parser("throughput", __doc__)
@@ -69,7 +69,8 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     args.options = flags
     if args.hours is not None:
         hours.read(args.hours)
-        check_can_write(args.hours)
+        if args.quick:
+            raise ConfigError("a short turn does not belong into a table of runs; leave out --quick or --hours")
     config = parse_config(flags)
     if config.env.sensor != "events" and not args.whole_only:
         raise ConfigError(f"parts can be timed only for env.sensor events; {config.env.sensor} needs --whole-only")
@@ -204,7 +205,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(table(report))
     json_report.write(args.json, report)
     if args.hours is not None:
-        row = hours.row_of(report, describe_processor(), args.options)
+        row = hours.row_of(report, args.options)
         print(hours.summary(hours.add(args.hours, row), row))
     return 0
 

@@ -200,3 +200,13 @@ def test_a_function_is_loaded_whatever_it_is_given_by(folder: Path) -> None:
     assert outcomes(again) == expected and traced == [2, 3, 2]
     other = jax.device_put(jnp.arange(3.0), jax.devices()[-1])
     assert again(other).devices() == other.devices() and again(np.arange(3.0, dtype=np.float32)).tolist() == [0, 2, 4]
+
+
+def test_what_only_tracing_needs_is_not_imported_before() -> None:
+    """MJX takes as long to import as JAX, and the parts of SciPy half of that."""
+    program = (
+        "import sys; import edqn_jax.training.loop, edqn_jax.evaluation.world_check, edqn_jax.cli.train;"
+        "print([name for name in ('mujoco.mjx', 'trimesh', 'scipy.ndimage', 'scipy.spatial') if name in sys.modules])"
+    )
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert said == "[]\n"

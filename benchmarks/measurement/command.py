@@ -58,10 +58,10 @@ class Parser(argparse.ArgumentParser):
         """Returns the options, after which the clock shows that the benchmark measures.
 
         Raises:
-            ConfigError: if the file of `--json` or `--figure` cannot be written.
+            ConfigError: if the file of `--json`, `--figure` or `--hours` cannot be written.
         """
         args = self.parse_args(words)
-        for name in ("json", "figure"):
+        for name in ("json", "figure", "hours"):
             if getattr(args, name, None) is not None:
                 check_can_write(getattr(args, name))
         show_phase("measuring")

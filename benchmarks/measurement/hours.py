@@ -26,7 +26,7 @@ FIELDS: tuple[str, ...] = (
     "cores_busy_with_others",
     "steal",
 )
-"""Columns of the file, separated by tabs: time is UTC, options are those after `--`."""
+"""Columns of the file, separated by tabs: time is UTC, processor the device, options are those after `--`."""
 
 FIGURES = {
     "decisions_per_second": "decisions/s",
@@ -35,14 +35,14 @@ FIGURES = {
 }
 
 
-def row_of(report: dict[str, Any], processor: str, options: list[str]) -> dict[str, str]:
+def row_of(report: dict[str, Any], options: list[str]) -> dict[str, str]:
     """Returns the row of a report of `throughput.py` that was made now."""
     seen, whole = report["conditions"], report["rows"][0]
     others, steal = seen["cores_busy_with_others"], seen["steal"]
     return {
         "time": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M"),
         "commit": _commit(),
-        "processor": processor,
+        "processor": report["device"],
         "options": " ".join(options) or "-",
         "decisions_per_second": f"{report['decisions_per_second']:.0f}",
         "over_c_mujoco_rollout": f"{whole['over_c_mujoco_rollout']:.4f}",

@@ -14,8 +14,9 @@ from tests.support.pages import ROOT
 SEEN = {"cores_busy_with_others": None, "steal": 0.0123, "product_flops": 2e11}
 
 
-def report(rate: float, ratio: float, compiling: float) -> dict:
+def report(device: str, rate: float, ratio: float, compiling: float) -> dict:
     return {
+        "device": device,
         "conditions": SEEN,
         "decisions_per_second": rate,
         "compile_seconds": compiling,
@@ -33,7 +34,7 @@ def test_runs_come_back_as_they_were_added_and_their_medians_are_of_one_processo
         ("a", ["--num-envs", "64"], (2, 8, 2)),
         ("a", [], (20_000, 0.25, 12)),
     ):
-        row = hours.row_of(report(*figures), processor, options)
+        row = hours.row_of(report(processor, *figures), options)
         added.append(row)
         assert hours.add(file, row) == added == hours.read(file)
     assert added[0]["steal"] == "0.0123" and added[0]["cores_busy_with_others"] == "-"
@@ -46,6 +47,11 @@ def test_runs_come_back_as_they_were_added_and_their_medians_are_of_one_processo
         "9.5 s of compiling (8.0 to 12.0)."
     )
     assert "1 run on 1 day on" in hours.summary(added, added[2])
+
+
+def test_a_short_turn_is_not_added(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="leave out --quick or --hours"):
+        throughput.parse(["--quick", "--hours", str(tmp_path / "hours.tsv")])
 
 
 def test_the_page_says_what_the_table_says() -> None:

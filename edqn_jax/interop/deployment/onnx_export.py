@@ -47,8 +47,11 @@ INPUTS, OUTPUTS = ("counts", "own", "motion", "memory"), ("values", "memory_afte
 OPSET, IR_VERSION = 18, 8
 """The oldest that this network can be written in, so that onnxruntime reads it from `runner.OLDEST_ONNXRUNTIME` on."""
 
-EDGE_RAD, NUDGES = 3e-7, 8
-"""By how much a lean is nudged to find counts at an edge: some times what single precision rounds it by; how often."""
+EDGE, NUDGES = 3e-7, 8
+"""By how much own motion, the leans within it, is nudged to find counts at an edge, and how often.
+
+It is some times what single precision rounds a lean by, radians.
+"""
 
 TOLERANCE = 1e-5
 """Largest difference between a value of the Q-network in double precision and in ONNX, of the largest value where that
@@ -325,7 +328,7 @@ def _on_edges(policy: Policy, inputs: list[list[np.ndarray]], in_jax: Any) -> np
     """Returns whether the counts of each input [N] that are levelled stand at the edge of being rounded otherwise.
 
     Single precision may round them to the other side, in JAX as in ONNX, and a count is then another by 1. They are
-    found by leaning `EDGE_RAD` more or less, by which values that do not hang on such a count hardly change.
+    found by changing own motion by `EDGE`, by which values that do not hang on such a count hardly change.
     """
     found = np.zeros(len(inputs), bool)
     if not policy.config.encoder.levelled:
@@ -333,7 +336,7 @@ def _on_edges(policy: Policy, inputs: list[list[np.ndarray]], in_jax: Any) -> np
     rng, (wanted, _) = np.random.default_rng(1), in_jax(inputs)
     for _ in range(NUDGES):
         nudged = [
-            [counts, own, motion.astype(np.float64) + EDGE_RAD * rng.choice([-1.0, 1.0], motion.shape), memory]
+            [counts, own, motion.astype(np.float64) + EDGE * rng.choice([-1.0, 1.0], motion.shape), memory]
             for counts, own, motion, memory in inputs
         ]
         found |= _shares_apart(in_jax(nudged)[0], wanted) > TOLERANCE
@@ -362,7 +365,7 @@ def _compare(policy: Policy, model: bytes, checks: int) -> tuple[float, int, int
     on_edges = _on_edges(policy, inputs, in_double)
     if 2 * on_edges.sum() > checks:
         raise CheckError(
-            f"{on_edges.sum()} of {checks} random inputs change where the drone leans by {EDGE_RAD:g} rad more, so "
+            f"{on_edges.sum()} of {checks} random inputs change where own motion does by {EDGE:g}, so "
             "that ONNX and JAX cannot be compared; nothing was written"
         )
     tolerance = max(

@@ -109,7 +109,8 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->most = uprights + 1;
   w->found = malloc(sizeof(int) * (size_t)c->width * (size_t)(w->most + 1));
   if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres) return 0;
-  if (!w->patterns || !w->casters || !w->tilted || !w->heights || !prepare_fields(c, rows, s->fields, &w->fields)) return 0;
+  if (!w->patterns || !w->casters || !w->tilted || !w->heights) return 0;
+  if (!prepare_fields(c, rows, s->fields, &w->fields)) return 0;
   w->covering = w->found + c->width;
   w->v = w->u + w->stride, w->nearest = w->v + rows;
   /* What lies beyond the image repeats its edge, so that all numbers are finite. */
@@ -127,7 +128,8 @@ static void release(Work* w) {
 static void finish(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves, Work* w,
                    const float* ahead, float* column) {
   for (int b = 0; b < rounded_up(c->height) / LANES; ++b) {
-    const Lanes behind = blend(c, s, planes, e, waves, w->patterns, w->casters, ahead, load(w->v + b * LANES), &w->layers[b]);
+    const Lanes high = load(w->v + b * LANES);
+    const Lanes behind = blend(c, s, planes, e, waves, w->patterns, w->casters, ahead, high, &w->layers[b]);
     for (int l = 0; l < LANES && b * LANES + l < c->height; ++l) column[(b * LANES + l) * c->width] = behind[l];
   }
 }

@@ -150,7 +150,7 @@ def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
     present = [(str(name), np.flatnonzero(names == name)) for name in np.unique(names)]
     # Padded for all families of the mixture, also for one that none of these worlds is of.
     shapes = [jax.eval_shape(partial(_unchecked, name, _moving_in(name, moving)), keys) for name in mixture.shares]
-    # Most of it is XLA's time for compiling, which takes one core for a program.
+    # Most of the time is XLA's, which leaves other cores idle while it compiles one program.
     with ThreadPoolExecutor(thread_name_prefix="families") as threads:
         drawn = [threads.submit(_in_batches, name, _moving_in(name, moving), keys[which]) for name, which in present]
         by_family = [each.result() for each in drawn]
