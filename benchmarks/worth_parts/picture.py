@@ -54,6 +54,8 @@ SHORT = {
 CONTRASTS = (0.05, 0.2)
 """Of the sensors whose bytes are drawn; tables have others, and more resolutions than the smallest and the largest."""
 
+HATCH, PARTIAL = "////", "hatched: not every sensor of the axis was flown"
+
 MOST_NAMED = 3
 """Sensors that are named in a cell; more are counted."""
 
@@ -73,6 +75,8 @@ class Panel:
     columns: list[str]
     cells: dict[tuple[str, str], tuple[str, str]]
     """By row and column: who leads, and what is written there."""
+    partial: set[tuple[str, str]] = dataclasses.field(default_factory=set)
+    """Those in which a sensor of the axis was not flown."""
 
 
 def draw_map(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]], file: Path) -> Figure:
@@ -94,7 +98,7 @@ def draw_map(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]], f
     heights = [HEAD_IN + ROW_IN * len(panel.rows) for panel in panels]
     width = LABEL_IN + CELL_IN * max(FEWEST_COLUMNS, *(len(panel.columns) for panel in panels)) + 0.2
     shown = {who for panel in panels for who, _ in panel.cells.values()}
-    foot = 0.3 + 0.2 * -(-len(shown) // 3)
+    foot = 0.3 + 0.2 * -(-(len(shown) + any(panel.partial for panel in panels)) // 3)
     height = sum(heights) + foot
     with open_figure(width, height, file) as figure:
         figure.set_layout_engine("none")  # panels are placed to the inch
@@ -105,12 +109,14 @@ def draw_map(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]], f
             box = (LABEL_IN / width, top / height, across / width, ROW_IN * len(panel.rows) / height)
             _draw_panel(figure.add_axes(box), panel)
         marks = [Patch(color=COLOURS[who], label=LABELS[who]) for who in LABELS if who in shown]
+        if any(panel.partial for panel in panels):
+            marks.append(Patch(facecolor=COLOURS["–"], hatch=HATCH, edgecolor=MUTED, label=PARTIAL))
         figure.legend(handles=marks, loc="lower left", ncols=3, frameon=False, fontsize=7, bbox_to_anchor=(0.01, 0.0))
     return figure
 
 
 def _flights_panel(name: str, cells: Sequence[Cell]) -> Panel:
-    axis, found, heads, sides = AXES[name], {}, [], []
+    axis, found, heads, sides, partial = AXES[name], {}, [], [], set()
     for cell in cells:
         column, _, aside = cell.flown.partition(", ")
         parts = [cell.world, f"trained: {cell.trained}", aside]
@@ -119,7 +125,9 @@ def _flights_panel(name: str, cells: Sequence[Cell]) -> Panel:
         sides += [side] if side not in sides else []
         best = best_of(cell)
         found[side, column] = verdict_of(best, cell.rivals), _written(cell, best)
-    return Panel(f"{axis.question}: success in %, blind → best → depth", sides, heads, found)
+        if cell.missing:
+            partial.add((side, column))
+    return Panel(f"{axis.question}: success in %, blind → best → depth", sides, heads, found, partial)
 
 
 def _written(cell: Cell, best: Sequence[str]) -> str:
@@ -157,7 +165,8 @@ def _bytes_panel(rows: Sequence[success.Row]) -> Panel:
 def _draw_panel(axes: Axes, panel: Panel) -> None:
     for (row, column), (who, said) in panel.cells.items():
         x, y = panel.columns.index(column), panel.rows.index(row)
-        axes.add_patch(Rectangle((x, y), 1, 1, facecolor=COLOURS[who], edgecolor="white", linewidth=1.5))
+        hatch = HATCH if (row, column) in panel.partial else None
+        axes.add_patch(Rectangle((x, y), 1, 1, facecolor=COLOURS[who], edgecolor="white", linewidth=1.5, hatch=hatch))
         axes.text(x + 0.5, y + 0.5, said, ha="center", va="center", fontsize=6.5, color=INK, linespacing=1.3)
     axes.set_xlim(0, len(panel.columns))
     axes.set_ylim(len(panel.rows), 0)

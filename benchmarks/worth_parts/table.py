@@ -19,6 +19,9 @@ from worth_parts.axes import AXES, BLIND, DEPTH, FRAMES, Axis, camera_of, flown_
 GOAL = "1"
 """Digit of a flight that arrived."""
 
+LATE = "depth-late"
+"""Begins the names of true depth that is old."""
+
 DRAWS = 4000
 """Of the bootstrap of a cell, over seeds and missions; the missions of a draw are the same for all of its sensors."""
 
@@ -32,6 +35,8 @@ class Cell:
     flown: str
     arrived: dict[str, np.ndarray]
     """[S, M] bool by sensor: S seeds, M missions."""
+    missing: Sequence[str] = ()
+    """Rivals of the axis of which there is no row, so that who leads is said of the others alone."""
 
     @functools.cached_property
     def drawn(self) -> dict[str, np.ndarray]:
@@ -54,10 +59,16 @@ class Cell:
     @property
     def rivals(self) -> list[str]:
         """Returns the sensors that are compared: all but the controls; true depth of several ages where no other is."""
-        sensors = [sensor for sensor in self.arrived if sensor not in (BLIND, DEPTH)]
-        if all(sensor.startswith("depth-late") for sensor in sensors):
-            return [sensor for sensor in self.arrived if sensor != BLIND]
-        return [sensor for sensor in sensors if not sensor.startswith("depth-late")]
+        return rivals_of(self.arrived)
+
+
+def rivals_of(sensors: Iterable[str]) -> list[str]:
+    """Returns those of an axis's sensors that are compared; see `Cell.rivals`."""
+    known = list(sensors)
+    rivals = [sensor for sensor in known if sensor not in (BLIND, DEPTH)]
+    if all(sensor.startswith(LATE) for sensor in rivals):
+        return [sensor for sensor in known if sensor != BLIND]
+    return [sensor for sensor in rivals if not sensor.startswith(LATE)]
 
 
 def rows_of(rows: Iterable[success.Row], axis: str) -> list[success.Row]:
@@ -91,7 +102,8 @@ def cells_of(rows: Sequence[success.Row], axis: Axis) -> list[Cell]:
             if alike in row["flown"]:
                 arrived[sensor] = np.array([[digit == GOAL for digit in seed] for seed in row["flown"][alike]])
         if arrived.keys() - {BLIND, DEPTH} or len(axis.sensors) == len(arrived):
-            cells.append(Cell(world, trained, flown, arrived))
+            missing = [sensor for sensor in rivals_of(axis.sensors) if sensor not in arrived]
+            cells.append(Cell(world, trained, flown, arrived, missing))
     return cells
 
 
@@ -117,12 +129,12 @@ def _are_frames(sensors: Iterable[str]) -> bool:
 
 
 def all_cells(rows: Sequence[success.Row]) -> dict[str, list[Cell]]:
-    """Returns the cells of each axis of which there are rows.
+    """Returns the cells of each axis that has some.
 
     Raises:
         ConfigError: if rows of an axis were not measured alike.
     """
-    return {name: cells_of(found, axis) for name, axis in AXES.items() if (found := rows_of(rows, name))}
+    return {name: found for name, axis in AXES.items() if (found := cells_of(rows_of(rows, name), axis))}
 
 
 def tables(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]]) -> str:
@@ -159,6 +171,8 @@ def _flights_table(name: str, rows: Sequence[success.Row], cells: Sequence[Cell]
     for cell in cells:
         shown = " | ".join(_rate(cell, sensor) for sensor in columns)
         leads = verdict_of(best_of(cell), cell.rivals)
+        if cell.missing:
+            leads += f" (not flown: {', '.join(cell.missing)})"
         lines.append(f"| {cell.world} | {cell.trained} | {cell.flown} | {shown} | {leads} | {_ahead(cell)} |")
     return "\n".join(lines)
 

@@ -29,7 +29,7 @@ from tests.support.policies import CONFIG
 from tests.support.registries import keep_as_they_are
 from worth_parts import flown, own, table, traffic
 from worth_parts.axes import AXES, Place, config_of, flown_of, places_of
-from worth_parts.picture import draw_map
+from worth_parts.picture import HATCH, PARTIAL, draw_map
 
 LOOKS = AXES["looks"]
 
@@ -255,10 +255,15 @@ def test_the_table_shows_blind_sensors_and_depth_and_refuses_unequal_budgets() -
     assert "2 seeds × 200 missions a cell, the same for all sensors (test worlds 9200 to 9399), 1,000 decisions" in said
     (wood,) = [line for line in said.splitlines() if "| wood |" in line]
     # Who sees no look has flown one of them, and stands in all.
-    assert "| 25.0 (" in wood and "| 50.0 (" in wood and "| events | 30.0 (" in wood
+    assert "| 25.0 (" in wood and "| 50.0 (" in wood
+    assert "| events (not flown: frame-pair, frame-difference) | 30.0 (" in wood  # who leads is not said of all
     assert said.count("| medium |") == 6  # no cell of drawn training, of which there are no rows but the controls'
     with pytest.raises(ConfigError, match="the axis looks have other decisions than each other"):
         table.all_cells([*rows, row("frame-pair", 0.5, decisions=2000)])
+
+
+def test_an_axis_of_which_controls_alone_were_flown_has_no_table() -> None:
+    assert table.tables([blind := row("blind", 0.2)], table.all_cells([blind])) == "There are no rows."
 
 
 def test_the_map_has_a_panel_for_each_axis_and_says_what_its_colours_are(tmp_path: Path) -> None:
@@ -269,7 +274,11 @@ def test_the_map_has_a_panel_for_each_axis_and_says_what_its_colours_are(tmp_pat
     assert [text.get_text() for text in rates.get_yticklabels()] == ["medium, drawn, 32 × 24"]
     (legend,) = figure.legends
     said = {text.get_text() for text in legend.get_texts()}
-    assert said == {"events lead (bytes: events cost less)", "no difference"}
+    assert said == {"events lead (bytes: events cost less)", "no difference", PARTIAL}
+    assert {patch.get_hatch() for patch in looks.patches} == {HATCH}
+    whole = [*rows, row("frame-pair", 0.5), row("frame-difference", 0.5)]
+    looks, _ = draw_map(whole, table.all_cells(whole), tmp_path / "whole.png").axes
+    assert {patch.get_hatch() for patch in looks.patches} == {None}
     assert (tmp_path / "map.png").is_file()
     with pytest.raises(ConfigError, match="there are no rows of this benchmark"):
         draw_map([], {}, tmp_path / "none.png")
