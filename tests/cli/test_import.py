@@ -33,6 +33,7 @@ def test_the_words_of_a_command_are_told_from_what_it_imports() -> None:
             take_imports(words)
 
 
+@pytest.mark.whole
 def test_help_lists_what_a_file_or_a_module_registers_and_a_run_takes_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -28,6 +28,7 @@ def outcome_of(warned: str = "", **variables: str) -> tuple[str, str]:
     return result, folder
 
 
+@pytest.mark.whole
 def test_what_one_process_compiles_the_next_one_reads_and_what_is_damaged_is_compiled_again(tmp_path: Path) -> None:
     _, folder = outcome_of(XDG_CACHE_HOME=str(tmp_path))
     kept = sorted(Path(folder).iterdir())
@@ -40,6 +41,7 @@ def test_what_one_process_compiles_the_next_one_reads_and_what_is_damaged_is_com
     assert outcome_of("Error reading persistent compilation", XDG_CACHE_HOME=str(tmp_path)) == ("7.0", folder)
 
 
+@pytest.mark.whole
 def test_nothing_is_read_that_others_could_have_written(tmp_path: Path) -> None:
     _, folder = outcome_of(XDG_CACHE_HOME=str(tmp_path))
     Path(folder).chmod(0o777)

@@ -109,6 +109,7 @@ def test_what_is_flown_is_the_same_in_double_precision_and_strictness() -> None:
         np.testing.assert_allclose(step.flight.position, one[1].flight.position, rtol=1e-5)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_functions_of_the_task_keep_their_types_in_a_program_of_double_precision() -> None:
     env, params = functional.make(WORLD, observation="kinematics")

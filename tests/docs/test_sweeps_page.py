@@ -7,11 +7,14 @@ import shlex
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from edqn_jax.cli.train import parse_train
 
 PAGE = (Path(__file__).parents[2] / "docs" / "sweeps.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.whole
 def test_each_task_of_the_array_trains_one_point_of_the_grid() -> None:
     (script,) = re.findall(r"```bash\n(.*?)```", PAGE, re.DOTALL)
     script = script.replace("exec .venv/bin/python train.py", "echo")

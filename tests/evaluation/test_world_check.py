@@ -187,6 +187,7 @@ def test_a_random_world_is_checked_by_its_number() -> None:
         check_world(ROOMS, "rooms", seed=-1)
 
 
+@pytest.mark.whole
 def test_an_evaluation_and_a_training_warn_as_the_check_does(tmp_path: Path) -> None:
     tight = str(corridor(tmp_path, 1.4, length=60.0))
     whole = check_world(ROOMS, tight).warnings

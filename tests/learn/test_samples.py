@@ -133,6 +133,7 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), got, expected)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
     """In a world that is its own mirror: what is seen and known of one's motion, the signs of `MIRRORED_MOTION`."""

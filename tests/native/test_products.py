@@ -82,6 +82,7 @@ def test_what_is_not_finite_stays_so() -> None:
     )
 
 
+@pytest.mark.whole
 def test_a_network_is_rounded_where_it_is_asked_for_alone() -> None:
     config = AgentConfig()
     params = init_q(config, 40, 27, jax.random.key(0))

@@ -73,6 +73,7 @@ def test_around_a_long_wall_it_is_astars(asked_astar):
     assert len(asked_astar) == 1
 
 
+@pytest.mark.whole
 def test_where_there_is_no_path_it_is_nan():
     inside = small_world(box((1.5, 5.5, 2.5), (2.5, 6.5, 3.5))).scene  # the start is within the block
     outside = small_world(start=(-1.0, 6.0, 3.0)).scene

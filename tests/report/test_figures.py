@@ -340,6 +340,7 @@ def test_the_caption_of_a_prediction_says_how_far_its_distance_is_off(tmp_path):
     assert error_caption(np.full(true.shape, np.inf), true) == "predicted far away"
 
 
+@pytest.mark.whole
 def test_what_is_above_start_and_goal_is_cut_off_and_on_a_map_what_is_below_is_pale(roofed: Scene) -> None:
     oblique, above = make_cutaway(roofed, OBLIQUE), make_cutaway(roofed, MAP)
     assert oblique.note == "near walls cut away; cut at 4.0 m"

@@ -99,6 +99,7 @@ def test_a_map_of_a_hall_shows_its_walls_cut_and_its_floor_pale(roofed: Scene) -
     assert is_like(wall, SECTION * shaded(mesh.colour, UP)) and is_like(floor, pale(shaded(mesh.colour, UP)))
 
 
+@pytest.mark.whole
 def test_a_map_shows_what_stands_on_a_floor_that_is_part_of_the_mesh(tmp_path: Path) -> None:
     """As in a scan without a roof: walls and a table of the same mesh as the floor."""
     floor = box(bounds=[[0, 0, 0], [12, 8, 0.2]])
@@ -124,6 +125,7 @@ def test_a_mesh_without_a_floor_of_its_own_is_drawn_as_it_is(mesh: trimesh.Trime
     assert floor_of(Mesh(np.asarray(mesh.triangles), GREY), -1.0, 1.0) is None
 
 
+@pytest.mark.whole
 def test_a_view_from_beside_goes_through_the_near_wall_alone(roofed: Scene) -> None:
     (mesh,) = make_cutaway(roofed, OBLIQUE).meshes
     near = [normal @ OBLIQUE.towards > 0 for normal, _ in mesh.cuts]

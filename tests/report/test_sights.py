@@ -70,6 +70,7 @@ def sights() -> FlightRenderer:
     return sights_of(SMALL)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_events_are_those_that_the_drone_got(sights, flight):
     flown, steps = flight

@@ -44,6 +44,7 @@ def begin(config: Config, policy: Policy | None = None) -> Networks:
     return begin_networks(config, fresh, policy.config, policy.params)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("learner", ["dqn", "pqn"])
 def test_the_networks_are_the_policys_and_their_optimisers_fresh(learner: str) -> None:
     config = dataclasses.replace(SMALL, agent=dataclasses.replace(SMALL.agent, learner=learner))

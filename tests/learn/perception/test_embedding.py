@@ -103,6 +103,7 @@ def moved(one, two) -> bool:
     return any(not np.array_equal(a, b) for a, b in pairs)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", ["events", *in_whole(*SENSORS[1:])])
 @pytest.mark.slow
 def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(traced, name: str) -> None:

@@ -117,6 +117,7 @@ def test_dense_encoder_pools_single_events(kind, field):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("form", [Form.EVENTS, Form.PICTURE], ids=["events", "pictures"])
 @pytest.mark.parametrize("kind", ["table", *in_whole("network")])
 @pytest.mark.slow

@@ -129,6 +129,7 @@ def test_only_events_of_a_camera_on_the_body_are_levelled() -> None:
     assert dataclasses.replace(LEVEL, mount="body") == BODY
 
 
+@pytest.mark.whole
 def test_the_label_of_levelled_events_is_that_of_a_level_camera() -> None:
     """At the heading to which roll and pitch are relative; without levelling it is the body's own view."""
     scene = every_kind(np.random.default_rng(4))

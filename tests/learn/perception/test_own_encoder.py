@@ -69,6 +69,7 @@ def config(monkeypatch: pytest.MonkeyPatch) -> Config:
     return make_config("paper", camera={"width": 6, "height": 4}, encoder=encoder, events={"law": "esim"})
 
 
+@pytest.mark.whole
 def test_it_learns_inside_of_the_vae_and_the_agent_sees_its_mean(config: Config) -> None:
     params = vae.init_vae(config.encoder, SMALL, jax.random.key(0))
     rng = np.random.default_rng(0)

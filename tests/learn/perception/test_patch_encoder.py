@@ -162,6 +162,7 @@ def test_the_decoder_draws_what_the_target_holds(target, form, channels) -> None
         )
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize("products", ["float32", *in_whole("bfloat16")])
 def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone(products: str) -> None:

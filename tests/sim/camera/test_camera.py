@@ -151,6 +151,7 @@ BARS = {
 }
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize("sort", ["paper", "medium", "every kind"])
 def test_brightness_and_events_agree_with_supersampling(pictures, sort):
@@ -283,6 +284,7 @@ def view():
     return scene, position, jnp.asarray(rotation_of(0.1, 0.2, -3 * np.pi / 4), jnp.float32)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("mount", ["level", *in_whole("body")])
 @pytest.mark.slow
 def test_luma_is_eq_1s_weighting_of_the_colours_and_they_are_right(view, mount):

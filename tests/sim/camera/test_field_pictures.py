@@ -81,6 +81,7 @@ def agree(config: CameraConfig, scene: Scene, seed: int) -> None:
     assert same.mean() > 1 - TIES / 2 and picture.std() > 0.05
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("mount", ["level", *in_whole("body")])
 @settings(max_examples=6, deadline=None, phases=[Phase.explicit, Phase.generate])
 @given(seed=st.integers(0, 2**16))

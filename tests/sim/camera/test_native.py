@@ -123,12 +123,14 @@ def patterned_frames(rng: np.random.Generator) -> tuple[Scene, jax.Array, jax.Ar
     return frames([looking(crowd(rng), seed) for seed in range(4)], 8, seed=7)
 
 
+@pytest.mark.whole
 def test_c_draws_every_pattern_as_jax_does() -> None:
     rng = np.random.default_rng(6)
     if native.is_available("cpu"):
         agree(CONFIG, *patterned_frames(rng), ties=TIES)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("mount", ["level", *in_whole("body")])
 def test_c_draws_shadows_as_jax_does(mount: Literal["level", "body"]) -> None:
     rng = np.random.default_rng(9)
@@ -182,6 +184,7 @@ def test_c_draws_what_jax_does_of_a_camera_on_the_body(size: tuple[int, int], pa
     agree(config, scene, origin, tilted_poses(rng, 96), ties=TIES)
 
 
+@pytest.mark.whole
 def test_c_draws_what_jax_does_of_a_camera_on_the_body_within_shapes_and_on_their_axes() -> None:
     """Also from the ground's other side, and looking up and down."""
     if not native.is_available("cpu"):

@@ -57,6 +57,7 @@ def disagreement(config: CameraConfig, scene: Scene, place: NDArray, turn: NDArr
     return float(np.mean((kept < 0.5)[lit] != dark[lit])), float(np.mean(dark[lit])), int(lit.sum())
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("mount", ["level", *in_whole("body")])
 def test_what_is_dark_is_what_a_ray_of_mujoco_towards_the_sun_says(mount: Mount) -> None:
     config, rng, found = dataclasses.replace(CONFIG, mount=mount), np.random.default_rng(5), []
@@ -69,6 +70,7 @@ def test_what_is_dark_is_what_a_ray_of_mujoco_towards_the_sun_says(mount: Mount)
     assert wrong < SILHOUETTES and dark > 0.05 and count > 500, found
 
 
+@pytest.mark.whole
 def test_meshes_cast_shadows_also_on_themselves(tmp_path: Path) -> None:
     geoms = (
         '<geom type="mesh" mesh="bracket" pos="10 5 2" euler="0 0 30"/><geom type="mesh" mesh="block" pos="14 5 2"/>'

@@ -67,6 +67,7 @@ def test_a_pixel_is_the_average_of_what_is_in_it(name: str) -> None:
     assert name == "blank" or np.std(drawn) > 0.05
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("mount, most", [("level", 0.014), ("body", 0.015)])
 def test_pictures_of_every_pattern_agree_with_supersampling(mount: Literal["level", "body"], most: float) -> None:
     """With a light of its own, from near enough to see what the patterns are."""

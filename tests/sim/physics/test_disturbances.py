@@ -381,6 +381,7 @@ def test_draws_are_uniform_within_their_limits_and_differ_between_episodes():
     assert np.abs(np.corrcoef(numbers) - np.eye(len(numbers))).max() < 0.06  # four deviations of 1 / sqrt(4000)
 
 
+@pytest.mark.whole
 def test_an_episode_keeps_what_it_drew_and_the_next_one_draws_anew(world):
     states, _, steps = flown(EVERYTHING, world, [AHEAD] * 4)
     assert [bool(step.is_reset) for step in steps] == [False, False, False, True]
@@ -401,6 +402,7 @@ def test_the_same_key_flies_the_same_disturbed_flight_and_another_key_another_on
     assert np.all(ends[0] != ends[2])
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("engine", ENGINES)
 def test_with_everything_on_no_key_is_used_twice_and_no_rank_is_promoted(engine, world):
     config = with_engine(engine, EVERYTHING)

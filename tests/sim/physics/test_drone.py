@@ -285,6 +285,7 @@ def test_the_drone_recovers_from_a_tilt_of_45_degrees_on_the_spot(decide):
     assert jnp.linalg.norm(states.velocity, axis=-1).max() < 0.01
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_hundred_thousand_random_decisions_never_diverge_nor_tip_the_drone_over(decide):
     rng = np.random.default_rng(4)

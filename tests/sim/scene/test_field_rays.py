@@ -201,6 +201,7 @@ def test_a_plate_of_a_millimetre_is_seen_from_the_front_and_aslant(tmp_path: Pat
         np.testing.assert_allclose(np.asarray(depth), 1, atol=0.1)
 
 
+@pytest.mark.whole
 @pytest.mark.usefixtures("in_c_or_jax")
 def test_no_ray_reads_beyond_a_grid_so_long_that_32_bits_round_its_numbers() -> None:
     half, nothing = np.array([20100.0, 0.4, 0.4]), (np.zeros((0, 3)), np.zeros((0, 3), np.int64))

@@ -139,6 +139,7 @@ def test_it_is_drawn_in_figures_and_on_the_page(world: Path) -> None:
     assert [shape["kind"] for shape in world_data(scene)["shapes"]] == ["faces"] * 3
 
 
+@pytest.mark.whole
 def test_where_many_triangles_move_fewer_are_drawn_and_on_the_page_all(tmp_path: Path) -> None:
     scene = mjcf.load_scene(mesh_world(tmp_path, '<geom type="mesh" mesh="m" pos="9 5 3"/>', m=ball(300)))
     (solid,) = solids_of(scene)
@@ -147,6 +148,7 @@ def test_where_many_triangles_move_fewer_are_drawn_and_on_the_page_all(tmp_path:
     assert drawn["kind"] == "mesh" and len(drawn["triangles"]) == len(ball(300)[1]) > 400
 
 
+@pytest.mark.whole
 def test_pools_hold_worlds_with_and_without_meshes_and_with_others(world: Path, tmp_path: Path) -> None:
     some, plain = mjcf.load_scene(world), boxes_only(tmp_path)
     other = mjcf.load_scene(mesh_world(tmp_path, EGG.replace("9 4 4", "5 5 3"), egg=egg()))

@@ -69,6 +69,7 @@ def test_the_slope_is_the_largest_gradient_there_is(mesh: trimesh.Trimesh) -> No
     assert steepest == pytest.approx(grid.slope, rel=0.02) and 1.0 < grid.slope < 4.0
 
 
+@pytest.mark.whole
 @settings(max_examples=4, deadline=None)
 @given(mesh=MESHES, seed=st.integers(0, 1000))
 def test_a_step_of_the_whole_distance_ends_before_the_mesh(mesh: trimesh.Trimesh, seed: int) -> None:

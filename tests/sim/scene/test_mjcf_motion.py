@@ -98,6 +98,7 @@ def test_a_ball_is_thrown_at_the_files_own_drone(world_of):
     check_scene(world.scene, 0.36)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_moving_random_world_survives_being_written(tmp_path):
     pool = random_pool("medium", world_keys("test", 2), Moving(share=0.8, balls=3, ball_gravity_m_s2=3.0))

@@ -323,6 +323,7 @@ def close_by(scene: Scene, time: float, rng: np.random.Generator):
     return points[np.argmax((gap > 0) & (gap < 0.5))]
 
 
+@pytest.mark.whole
 def test_contact_with_moving_shapes_is_where_dense_sampling_finds_it():
     rng = np.random.default_rng(0)
     touched = free = 0
@@ -366,6 +367,7 @@ def test_a_hovering_drone_is_hit_by_what_moves_into_it():
     assert not np.asarray(path_contact(scene, path, RADIUS)[0]).any()  # without times the world stands as at time 0
 
 
+@pytest.mark.whole
 def test_a_fast_ball_does_not_pass_through_between_two_physics_steps():
     # 30 m/s: 0.6 m in a step, with 0.1 + 0.1 m of radii; at both ends of the step it is free.
     fast = ball([10, 6, 5], radius=0.1, motion=motion(velocity=(30, 0, 0), low=(0, 0, 0), high=(40, 30, 12)))
@@ -378,6 +380,7 @@ def test_a_fast_ball_does_not_pass_through_between_two_physics_steps():
     assert bool(alone[0]) and abs(float(alone[1]) - float(fraction[1])) < 1e-5
 
 
+@pytest.mark.whole
 def test_the_search_of_a_path_finds_no_less_than_the_search_of_each_segment():
     rng = np.random.default_rng(1)
     for _ in range(20):

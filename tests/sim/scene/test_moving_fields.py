@@ -171,6 +171,7 @@ def gaps_along(mesh: MovedMesh, path: np.ndarray, times: np.ndarray, each: int) 
     return np.array(gaps) - RADIUS
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("flights", "least"), [(12, 1), pytest.param(30, 5, marks=pytest.mark.whole)])
 def test_what_it_runs_into_is_touched_when_its_triangles_touch_it(flights: int, least: int, tmp_path: Path) -> None:
     rng, each = np.random.default_rng(0), 8
@@ -232,6 +233,7 @@ def test_a_mesh_that_bounces_in_the_volume_turns_back_where_its_box_ends(tmp_pat
     assert abs(x.min() - half) < 0.06 and abs(x.max() - (20 - half)) < 0.06
 
 
+@pytest.mark.whole
 def test_height_fields_and_ellipsoids_move_with_what_else_a_body_holds(tmp_path: Path) -> None:
     file = tmp_path / "cart.xml"
     file.write_text(

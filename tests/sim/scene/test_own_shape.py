@@ -172,6 +172,7 @@ def test_it_may_block_the_only_way(world: Path) -> None:
     assert not bool(has_way(mjcf.load_scene(world), size, RADIUS, 0.5))
 
 
+@pytest.mark.whole
 def test_without_the_kind_it_is_a_field(tmp_path: Path) -> None:
     file = tmp_path / "egg.xml"
     file.write_text(blocks_of(PAGE, "xml")[0], encoding="utf-8")

@@ -49,6 +49,7 @@ def interpolated(grid: Grid, points: np.ndarray) -> np.ndarray:
     return RegularGridInterpolator(lattice_axes(np.array(grid.values.shape), grid.cell), grid.values)(points)
 
 
+@pytest.mark.whole
 def test_distances_on_a_lattice_are_exact_near_the_surface_and_a_little_small_elsewhere() -> None:
     mesh = MESHES["ring"]
     counts = np.array([41, 41, 21])
@@ -66,6 +67,7 @@ def test_distances_on_a_lattice_are_exact_near_the_surface_and_a_little_small_el
     assert np.isinf(middles).any() and (corners < 0).any()
 
 
+@pytest.mark.whole
 def test_far_from_many_things_no_distance_is_too_large() -> None:
     # Half way between two things, the nearest point beside a surface is often not beside the nearest surface.
     rng = np.random.default_rng(3)
@@ -84,6 +86,7 @@ EVERY_DAY = [("ring", False), ("walls", True)]
 OTHERS = [each for each in itertools.product(MESHES, (False, True)) if each not in EVERY_DAY]
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("name", "turned"), [*EVERY_DAY, *(pytest.param(*each, marks=pytest.mark.whole) for each in OTHERS)]
 )

@@ -53,6 +53,7 @@ def test_a_contrast_is_log_uniform_and_known_from_about_minus_1_to_1():
     np.testing.assert_allclose(contrast.contrast_of(values), drawn, rtol=1e-5)
 
 
+@pytest.mark.whole
 def test_an_episode_keeps_its_contrast_which_own_state_and_motion_end_with():
     pool = stack_scenes([load_scene(WORLD)])
     world = env.EnvParams(load_airframe(Config().drone), pool, own_missions(pool))

@@ -136,6 +136,7 @@ def test_a_change_must_exceed_the_threshold():
     np.testing.assert_array_equal(events.event_polarity(-change, threshold), [0, 0, -1])
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("pixels", [9, *in_whole(1)])
 @pytest.mark.parametrize("faults_share", [1.0, *in_whole(0.0)])
 def test_the_dvs_flies_with_any_refractory_period(pixels, faults_share):
@@ -413,6 +414,7 @@ def test_each_frame_pair_has_the_noise_of_its_own_length():
     np.testing.assert_allclose(count, [1 - math.exp(-1), sevens], rtol=0.02)
 
 
+@pytest.mark.whole
 @few
 @given(seed=seeds, law=st.sampled_from(list(FIRING)))
 def test_signal_and_noise_are_merged_as_by_the_plain_loop(seed, law):

@@ -48,6 +48,7 @@ def test_time_and_gain_are_the_least_that_reach_the_target(lux, mean):
     np.testing.assert_allclose([time, gain], plain, rtol=2e-4)
 
 
+@pytest.mark.whole
 @few
 @given(seed=st.integers(0, 2**31 - 1), steps=st.integers(1, 3), share=st.floats(0.01, 1.0))
 def test_sub_frames_are_taken_where_the_drone_was(seed, steps, share):
@@ -222,6 +223,7 @@ def test_a_turning_camera_smears_what_it_sees_over_its_exposure(scene):
     assert np.abs(wanted - views[0]).max() > 0.03 and inside.mean() > 0.5
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_what_moves_is_smeared_where_the_drone_stands_still():
     """Each part of an exposure sees the world at its own time."""

@@ -50,6 +50,7 @@ def flight_of(path: np.ndarray, first: int, steps: int, *, times: bool = False) 
     return Flight(rows, upright, rows, (first + jnp.arange(steps + 1)) * DT if times else None)
 
 
+@pytest.mark.whole
 @few
 @given(
     seed=st.integers(0, 2**31 - 1),

@@ -64,6 +64,7 @@ def test_an_illuminance_is_log_uniform():
     assert float(light.sample_illuminance(LightConfig(7.0, 7.0), jax.random.key(1))) == pytest.approx(7.0, rel=1e-6)
 
 
+@pytest.mark.whole
 def test_an_episode_keeps_its_light_and_the_next_one_has_another(world):
     state, _ = jax.jit(lambda key: env.reset(LIT, world, key))(jax.random.key(0))
     step = jax.jit(lambda s: env.step(LIT, world, s, 13)[0])

@@ -246,6 +246,7 @@ def test_pixels_without_bandwidth_limits_carry_nothing(flown):
     assert len(jax.tree.leaves(sensor.at_rest(config, jax.random.key(0)))) == 3  # light, lag and last frame
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_decisions_of_a_stream_are_one_recording_of_the_flight():
     """Windows go on where they ended: no change is lost between two decisions, and none counted twice."""

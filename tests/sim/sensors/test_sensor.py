@@ -78,6 +78,7 @@ def scenes():
     return [(scene, take_scene(pool, index)) for index, scene in enumerate(drawn)]
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_frame_is_the_logarithm_of_the_camera_by_brute_force(scenes) -> None:
     config = config_of("frames")
@@ -343,6 +344,7 @@ def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> Non
     assert decision_latency_ms(config, params, calls=1)["median"] > 0.0
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_new_sensor_needs_only_its_entry_to_train(with_new_sensor, world) -> None:
     config = with_new_sensor

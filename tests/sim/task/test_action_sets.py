@@ -72,6 +72,7 @@ def test_a_velocity_that_is_a_move_commands_the_same_to_the_bit(heading):
     np.testing.assert_array_equal(MOVES.direction(body, jnp.arange(27)), ACTIONS)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_velocity_that_is_a_move_flies_the_same_flight_also_a_decision_late(late):
     state, step = late

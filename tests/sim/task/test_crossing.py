@@ -41,6 +41,7 @@ def clearance(pool: Scene, points: np.ndarray) -> np.ndarray:
 
 
 # Each family and each number of drones; every pair would be another program to compile.
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("family", "drones"),
     [

@@ -729,6 +729,7 @@ def test_many_environments_at_once_are_the_same_as_one_by_one(reset, step):
             assert np.mean(np.asarray(wrong)) < 0.01  # a rare event on the threshold
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("law", ["paper", *in_whole("esim")])
 @pytest.mark.slow
 def test_no_key_is_used_twice_and_no_rank_is_promoted(world, law):
@@ -744,6 +745,7 @@ def test_no_key_is_used_twice_and_no_rank_is_promoted(world, law):
     assert isinstance(after.drone, DroneState)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_nobody_is_paid_for_a_way_through_a_wall():
     """A drone that crashes into a thin wall ends the decision behind it, where the goal is many metres nearer."""

@@ -253,6 +253,7 @@ def test_true_distances_are_to_the_surface_of_the_other_where_it_is_at_the_end_o
         assert shown[1].min() < -0.3 and np.abs(np.asarray(steps[0].observation.sensed)[0, 1]).max() == 0.0
 
 
+@pytest.mark.whole
 def test_the_label_shows_the_others_where_they_are_after_the_decision():
     config = configured(2, sensor="depth")
     world = world_of(((10, 20, 10), (50, 20, 10)), ((13, 20, 10), (50, 20, 10)))
@@ -283,6 +284,7 @@ def test_another_order_of_the_drones_in_a_group_gives_the_same_flights_in_that_o
             assert np.allclose(x[np.array(order)], y, atol=1e-5)
 
 
+@pytest.mark.whole
 def test_a_drone_that_meets_nobody_flies_and_sees_as_alone():
     ends = (((10, 20, 6), (50, 20, 6)), ((4, 38, 6), (1, 39, 6)))
     _, steps = fly(world_of(*ends), [[AHEAD, HOVER]] * 6)

@@ -87,6 +87,7 @@ def hovered():
 # ---------------------------------------------------------------------------------------- what is seen
 
 
+@pytest.mark.whole
 def test_an_obstacle_makes_events_by_its_own_motion_while_the_drone_hovers(hovered):
     counts = {}
     for moving, (_, first, steps) in hovered.items():
@@ -108,6 +109,7 @@ def test_events_are_where_the_obstacles_edges_are(hovered):
     assert int(states[4].decision) == 4
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", ["ranges", *in_whole("frame-pair", "frames", "depth")])
 def test_every_frame_sees_the_world_at_its_own_time(name):
     config, world = configured(name), world_of(pillar(sliding()))
@@ -155,6 +157,7 @@ def test_true_depth_with_the_obstacles_motion_shows_who_comes_and_not_that_the_d
     np.testing.assert_allclose(there, np.stack([depth[0], np.zeros_like(depth[0])]), atol=1e-5)
 
 
+@pytest.mark.whole
 def test_a_window_as_long_as_a_decision_begins_at_its_beginning():
     config = configured("frame-pair")
     window = (-N * DT, 0.0)
@@ -185,6 +188,7 @@ def test_the_own_state_knows_nothing_of_what_moves(hovered):
         np.testing.assert_array_equal(ours.observation.motion, theirs.observation.motion)
 
 
+@pytest.mark.whole
 def test_pictures_for_people_show_the_moment():
     world = world_of(pillar(sliding()))
     environment = Environment(CONFIG, world)
@@ -338,6 +342,7 @@ def test_an_episode_begins_at_time_zero_again():
     np.testing.assert_array_equal(event_image(steps[3].observation.sensed), event_image(first.sensed))
 
 
+@pytest.mark.whole
 def test_a_reward_is_told_the_clearance_at_the_decisions_end():
     told = []
 

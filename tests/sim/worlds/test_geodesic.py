@@ -84,6 +84,7 @@ def test_through_a_thin_wall_it_is_the_way_around():
     assert before - behind > 10.0
 
 
+@pytest.mark.whole
 def test_through_a_thin_wall_of_a_mesh_it_is_the_way_around(tmp_path):
     # As above: of two boxes side by side, so that the mesh is not convex.
     parts = [hull(CUBE * [0.1, 4.0, 4.0] + [10, 4, 3]), hull(CUBE * [0.3, 0.5, 4.0] + [10, 1, 3])]

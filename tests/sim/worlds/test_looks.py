@@ -40,6 +40,7 @@ def drawn() -> Scene:
     return pool_of("drawn")
 
 
+@pytest.mark.whole
 def test_plaid_worlds_have_no_look_and_others_are_the_same_bodies(drawn: Scene) -> None:
     plain = plain_pool()
     assert jax.tree.structure(pool_of("plaid")) == jax.tree.structure(plain)
@@ -70,6 +71,7 @@ def test_a_surface_reflects_no_more_than_it_gets_and_has_periods_within_the_limi
         assert coarse.max() > 10 * coarse.min()
 
 
+@pytest.mark.whole
 def test_no_pattern_leaves_the_range_of_its_contrast() -> None:
     for pattern in set(OWN) - {"drawn"}:
         a, b, c, d = np.moveaxis(np.abs(np.asarray(pool_of(pattern).boxes.surface.numbers)[..., SHARES:PHASES]), -1, 0)

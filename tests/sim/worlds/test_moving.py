@@ -47,6 +47,7 @@ def places(scene: Scene, times):
     return {kind: getattr(now, kind).position for kind in KINDS}
 
 
+@pytest.mark.whole
 def test_at_time_zero_a_moving_world_is_the_still_one_of_the_same_key(pools):
     still = pools["still"]
     assert not has_motion(still)
@@ -121,6 +122,7 @@ def _nearest(scene, point, times):
     return jnp.min(jax.vmap(lambda t: signed_distance(scene_at(unthrown, t), point))(times))
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", ["moving", *in_whole("everything")])
 def test_who_hovers_at_a_start_is_left_alone_for_two_seconds(pools, name):
     times = jnp.arange(0, EARLY_S + 1e-6, 0.02)
@@ -143,6 +145,7 @@ def test_no_worlds_own_start_is_swept_in_the_first_seconds():
         assert float(least.min()) >= CLEARANCE - 0.625  # at 5 m/s, 0.125 s from a sample
 
 
+@pytest.mark.whole
 def test_without_the_care_for_the_first_seconds_starts_would_be_swept(pools):
     """So the test before can fail: free points of the still world are not free in the moving one."""
     missions = random_missions(pools["still"], 200, jax.random.key(0))
@@ -154,6 +157,7 @@ def test_without_the_care_for_the_first_seconds_starts_would_be_swept(pools):
     assert min(least) < RADIUS
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("family", "bodies"), [("canyon", canyon.BODIES), pytest.param("forest", forest.BODIES, marks=pytest.mark.whole)]
@@ -250,6 +254,7 @@ def test_no_ball_comes_near_the_start_in_the_first_seconds(pools):
         assert np.linalg.norm(at - np.asarray(scene.start), axis=-1).min() > 3.0
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize("family", ["sparse", pytest.param("forest", marks=pytest.mark.whole)])
 def test_moving_worlds_reuse_no_key_and_promote_no_rank(family):

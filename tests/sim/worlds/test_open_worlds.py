@@ -25,6 +25,7 @@ def footprint(shape) -> tuple[float, float, float]:
     return float(shape.position[0]), float(shape.position[1]), float(reach)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(("density", "least", "most"), [("sparse", 12, 12), ("medium", 28, 30), ("dense", 54, 60)])
 @pytest.mark.slow
 def test_a_density_has_its_number_of_shapes_and_their_widths(pools, density, least, most):
