@@ -69,6 +69,7 @@ def test_scale_and_the_axis_that_points_up_are_taken(kind: str) -> None:
     flown_inside("here")
 
 
+@pytest.mark.whole
 def test_what_is_not_closed_has_a_thickness(capsys: pytest.CaptureFixture[str]) -> None:
     mesh = room()
     trimesh.Trimesh(mesh.vertices, mesh.faces[12:-1], process=False).export("open.ply")

@@ -79,6 +79,7 @@ def test_what_is_drawn_belongs_together() -> None:
         jax.tree.map(lambda x, y, at=index: np.testing.assert_array_equal(x[at], y), drawn, source)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("architecture", "even", "alone"),
     [

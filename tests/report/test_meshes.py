@@ -134,6 +134,7 @@ def test_a_view_from_beside_goes_through_the_near_wall_alone(roofed: Scene) -> N
     assert make_cutaway(room, OBLIQUE).meshes[0].cuts == ()
 
 
+@pytest.mark.whole
 def test_what_is_drawn_of_a_mesh_is_what_the_axes_show(roofed: Scene) -> None:
     axes = Figure().add_subplot()
     plot_stage(axes, OBLIQUE, roofed, 2.0)

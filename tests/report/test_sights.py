@@ -126,6 +126,7 @@ def test_own_motions_are_those_that_the_drone_knew(flight):
     np.testing.assert_array_equal(own_motions(config, as_velocities, decision_rows(config, flown)), motion)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_the_true_nearness_is_what_the_sensor_depth_would_show(sights, flight):
     flown, _ = flight

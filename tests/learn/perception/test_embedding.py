@@ -146,6 +146,7 @@ def test_the_q_network_sees_a_code_or_the_ranges_or_only_the_own_state() -> None
     np.testing.assert_array_equal(blind, own)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("name", [*SENSORS[:2], *in_whole(*SENSORS[2:])])
 @pytest.mark.slow
 def test_a_decision_of_any_sensor_can_be_timed(name: str) -> None:

@@ -59,6 +59,7 @@ def single_events(field: event_field.EventField, pairs: int) -> list[patch_encod
     return [found[at] for at in np.random.default_rng(1).permutation(len(found))]
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     ("pairs", "noise", "overlap"),
     [(1, True, 0), (2, False, 2), *rows_in_whole((1, False, 0), (2, False, 0), (2, True, 0))],

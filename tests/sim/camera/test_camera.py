@@ -357,6 +357,7 @@ def test_an_empty_world_is_sky():
     np.testing.assert_allclose(sky, np.broadcast_to((0.5, 0.25, 1.0), (24, 32, 3)), rtol=1e-6)
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_a_still_camera_sees_the_same_twice_and_a_moving_one_does_not(view):
     scene, position, rotation = view

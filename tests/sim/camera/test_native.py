@@ -172,6 +172,7 @@ def tilted_poses(rng: np.random.Generator, count: int) -> jax.Array:
     return jnp.asarray(np.stack([rotation_of(*tilt) for tilt in tilts]), jnp.float32)
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("patterned", [False, *in_whole(True)])
 def test_c_draws_what_jax_does_of_a_camera_on_the_body(size: tuple[int, int], patterned: bool) -> None:
@@ -246,6 +247,7 @@ def test_the_kernels_of_gpus_draw_what_jax_draws(
         assert shutil.which("cc") is None
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize(
     "size, world, rays, patterned",
     [
@@ -283,6 +285,7 @@ def test_the_kernels_of_gpus_draw_what_c_draws_of_a_camera_on_the_body(
         assert np.mean(~np.isclose(first, second, rtol=1e-4, atol=1e-4)) < TIES
 
 
+@pytest.mark.whole
 def test_the_kernels_of_gpus_draw_every_pattern(kernels: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     call = native._call
     monkeypatch.setattr(native, "_call", lambda target, *given: call(f"emulated_{target}", *given))

@@ -214,6 +214,7 @@ def test_no_ray_reads_beyond_a_grid_so_long_that_32_bits_round_its_numbers() -> 
     assert not bool(hit.any())
 
 
+@pytest.mark.whole
 @pytest.mark.usefixtures("in_c_or_jax")
 def test_a_ray_that_comes_near_to_wide_ground_and_leaves_it_meets_nothing() -> None:
     height = np.broadcast_to(0.1 * (np.arange(41.0) - 20), (641, 5, 41))

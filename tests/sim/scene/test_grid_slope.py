@@ -55,6 +55,7 @@ def test_distances_of_two_places_differ_by_no_more_than_the_slope_says(mesh: tri
     assert np.all(np.abs(value(one) - value(other)) <= grid.slope * apart + 1e-9)
 
 
+@pytest.mark.whole
 @settings(max_examples=4, deadline=None)
 @given(mesh=MESHES)
 def test_the_slope_is_the_largest_gradient_there_is(mesh: trimesh.Trimesh) -> None:

@@ -87,6 +87,7 @@ def test_a_velocity_that_is_a_move_flies_the_same_flight_also_a_decision_late(la
     np.testing.assert_array_equal(state.disturbance.move, ACTIONS[4])
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 def test_what_is_beyond_the_bounds_is_clipped_and_what_is_not_finite_diverges(late, rates):
     for state, step, size in ((*late, 3), (*rates, 4)):

@@ -99,6 +99,7 @@ def test_an_obstacle_makes_events_by_its_own_motion_while_the_drone_hovers(hover
     assert min(counts[True]) > 20
 
 
+@pytest.mark.whole
 def test_events_are_where_the_obstacles_edges_are(hovered):
     states, _, steps = hovered[True]
     image = np.abs(np.asarray(event_image(steps[3].observation.sensed)))

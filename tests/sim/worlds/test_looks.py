@@ -53,6 +53,7 @@ def test_plaid_worlds_have_no_look_and_others_are_the_same_bodies(drawn: Scene) 
         np.testing.assert_array_equal(getattr(plain, name), getattr(drawn, name))
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("pattern", [*OWN[:3], *in_whole(*OWN[3:])])
 def test_a_surface_reflects_no_more_than_it_gets_and_has_periods_within_the_limits(pattern: str) -> None:
     pool = pool_of(pattern)

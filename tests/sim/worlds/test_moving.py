@@ -62,6 +62,7 @@ def test_at_time_zero_a_moving_world_is_the_still_one_of_the_same_key(pools):
         np.testing.assert_allclose(pools[name].start, still.start, atol=1e-4)
 
 
+@pytest.mark.whole
 def test_half_of_the_obstacles_move_in_the_worlds_moving_and_the_option_says_how_many(pools):
     shares = {}
     for name in ("moving", "everything"):

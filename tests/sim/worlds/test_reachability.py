@@ -40,6 +40,7 @@ def world(seed: int) -> Scene:
     return build_scene(shapes, volume=[(0, 0, 0), (9, 9, height)], start=[1.5, 4.5, 2], goal=[7.8, 4.5, 2.3])
 
 
+@pytest.mark.whole
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 14), marks=pytest.mark.whole)])
 def test_it_says_what_the_plain_one_says_and_finds_no_way_that_astar_does_not(seeds):
