@@ -264,7 +264,7 @@ class Checkpointer:
         ]
         agents = [
             AgentProgress(
-                kept=Candidate(params, **{name: agent[name] for name in _scores()}),
+                kept=Candidate(params, **{name: agent[name] for name in _scores() if name in agent}),
                 episodes=agent["episodes"],
                 validations=[(found[0], found[1], found[2]) for found in agent["validations"]],
             )

@@ -13,6 +13,11 @@ from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.training.setup import TrainingSetup
 from edqn_jax.user_code import IMPORTED
 
+HOVERS = 0.5
+"""Share of the validation missions that run out of time from which on a policy is said to hover."""
+LEAST_PRICE = -5
+"""Reward of a collision above which no lower price is proposed."""
+
 
 def describe_start(preparation: TrainingSetup, seeds: int | None) -> str:
     """Returns a line on the devices that a run trains on, and another on its missions if there is a note."""
@@ -100,6 +105,7 @@ def _of_one(summary: dict[str, Any], config: Config) -> str:
     text = (
         f"Validation: {summary['validation_success']:.0%} of {_count(config.train.validation_missions, 'mission')} "
         f"reached the goal, after {_count(summary['parameters_from_decisions'], 'decision')} of training.\n"
+        f"{_hovering(summary, config)}"
         f"{_flight(summary)} {ending} after {_count(summary['steps'], 'decision')} "
         f"({summary['flight_seconds']:.1f} s): {summary['path_length_m']:.1f} m flown, "
         f"shortest path to the goal's centre {summary['shortest_path_m']:.1f} m. "
@@ -116,6 +122,17 @@ def _of_one(summary: dict[str, Any], config: Config) -> str:
         f"{text}\nTook {format_duration(summary['total_seconds'])} in all, "
         f"{format_duration(summary['train_seconds'])} of it training. "
         "Everything is in"
+    )
+
+
+def _hovering(summary: dict[str, Any], config: Config) -> str:
+    """Returns a line with a remedy if most validation missions ran out of time; otherwise nothing."""
+    share, price = summary.get("validation_timed_out", 0.0), round(config.env.collision_reward / 3)
+    if share < HOVERS or price > LEAST_PRICE:
+        return ""
+    return (
+        f"{share:.0%} ran out of time: where a collision costs much, a policy may learn to hover. Try a lower price, "
+        f"with --env.collision-reward {price} --env.left-volume-reward {price}.\n"
     )
 
 

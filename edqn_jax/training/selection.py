@@ -31,6 +31,7 @@ class Candidate:
     success: float = 0.0  # share of validation missions
     success_near_start: float = 0.0  # share of those that begin at or near their world's own start
     decisions: int = 0  # trained before that validation, in all environments
+    timed_out: float = 0.0  # share of validation missions
 
 
 def is_due(config: Config, schedule: Schedule, checked: int, done: int) -> bool:
@@ -44,7 +45,8 @@ def make_candidate(
     config: Config, missions: RunMissions, flights: Flights, params: PolicyParams, decisions: int
 ) -> Candidate:
     """Returns the candidate for parameters, scored by the flights of their validation."""
-    arrived = np.asarray(flights.outcome) == Outcome.GOAL
+    outcome = np.asarray(flights.outcome)
+    arrived = outcome == Outcome.GOAL
     straight = _straight(missions.validation.env_params.missions, config.env.goal_radius_m)
     return Candidate(
         params,
@@ -52,6 +54,7 @@ def make_candidate(
         success=float(np.mean(arrived)),
         success_near_start=float(np.mean(arrived[missions.near_start])),
         decisions=decisions,
+        timed_out=float(np.mean(outcome == Outcome.TIME_OUT)),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shlex
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,18 @@ def test_a_run_ends_with_its_success_over_the_validation_missions_before_one_fli
     assert second.startswith(
         "The greedy flight through the paper's map, which training never used, ended in a collision"
     )
+
+
+def test_a_run_that_ends_in_hovering_says_how_it_may_fly() -> None:
+    def second_line(share: float, price: float) -> str:
+        config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, collision_reward=price))
+        return verdict(ONE | {"validation_timed_out": share}, RunDirectory(Path("here")), config).splitlines()[1]
+
+    assert second_line(0.62, -60.0) == (
+        "62% ran out of time: where a collision costs much, a policy may learn to hover. Try a lower price, with "
+        "--env.collision-reward -20 --env.left-volume-reward -20."
+    )
+    assert second_line(0.4, -60.0).startswith("The greedy flight") and second_line(0.9, -9.0).startswith("The greedy")
 
 
 @pytest.mark.parametrize(("summary", "flies"), [(ONE, ""), (SEEDS, "seed-3")])
