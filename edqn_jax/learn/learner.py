@@ -37,6 +37,7 @@ Metrics = dict[str, Array]
 RUN_METRICS = (
     *("phase", "decisions", "decisions_per_second", "episodes", "success_rate", "mean_return", "diverged"),
     *("skipped_updates", "warm_up", "validation_success", "validation_mission", "validation_spl"),
+    "validation_timed_out",
 )
 """What `metrics.jsonl` has of every run, whatever learns in it."""
 

@@ -336,6 +336,7 @@ class _Loop:
                 "validation_success": latest.success,
                 "validation_mission": latest.success_near_start,
                 "validation_spl": latest.spl,
+                "validation_timed_out": latest.timed_out,
             }
             found.append((metrics, (agent.missions.validation, flights)))
         preparation.display.phase("training")

@@ -80,7 +80,8 @@ def test_what_diverged_is_counted_and_not_averaged() -> None:
     found = chunk_metrics(CONFIG, 0, ended, ill(gradient=2), 1.0, 2)
     assert (found["diverged"], found["mean_return"], found["success_rate"]) == (1, 8.0, 0.5)
     assert found["skipped_updates"] == 80
-    assert {"validation_success", "validation_mission", "validation_spl"} | set(found) == {*RUN_METRICS, *ill().metrics}
+    of_validation = {f"validation_{name}" for name in ("success", "mission", "spl", "timed_out")}
+    assert of_validation | set(found) == {*RUN_METRICS, *ill().metrics}
 
 
 def test_ended_episodes_are_those_with_an_outcome_counted_in_decisions_of_all_environments() -> None:
