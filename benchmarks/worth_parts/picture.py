@@ -54,7 +54,7 @@ SHORT = {
 CONTRASTS = (0.05, 0.2)
 """Of the sensors whose bytes are drawn; tables have others, and more resolutions than the smallest and the largest."""
 
-HATCH, PARTIAL = "////", "hatched: not every sensor of the axis was flown"
+HATCH, PARTIAL = "//", "hatched: not every sensor of the axis was flown"
 
 MOST_NAMED = 3
 """Sensors that are named in a cell; more are counted."""
@@ -110,7 +110,7 @@ def draw_map(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]], f
             _draw_panel(figure.add_axes(box), panel)
         marks = [Patch(color=COLOURS[who], label=LABELS[who]) for who in LABELS if who in shown]
         if any(panel.partial for panel in panels):
-            marks.append(Patch(facecolor=COLOURS["–"], hatch=HATCH, edgecolor=MUTED, label=PARTIAL))
+            marks.append(Patch(facecolor=COLOURS["no difference"], hatch=HATCH, edgecolor="white", label=PARTIAL))
         figure.legend(handles=marks, loc="lower left", ncols=3, frameon=False, fontsize=7, bbox_to_anchor=(0.01, 0.0))
     return figure
 

@@ -264,7 +264,7 @@ class Checkpointer:
         ]
         agents = [
             AgentProgress(
-                kept=Candidate(params, **{name: agent[name] for name in _scores() if name in agent}),
+                kept=Candidate(params, **{name: agent[name] for name in _scores() if name in agent or name != _NEWEST}),
                 episodes=agent["episodes"],
                 validations=[(found[0], found[1], found[2]) for found in agent["validations"]],
             )
@@ -282,6 +282,10 @@ class Checkpointer:
 
     def _decisions(self, standing: RunProgress) -> int:
         return standing.done * self.config.train.num_envs
+
+
+_NEWEST = "timed_out"
+"""The score that checkpoints of older runs do not have."""
 
 
 def _scores() -> list[str]:

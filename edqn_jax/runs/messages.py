@@ -16,7 +16,7 @@ from edqn_jax.user_code import IMPORTED
 HOVERS = 0.5
 """Share of the validation missions that run out of time from which on a policy is said to hover."""
 LEAST_PRICE = -5
-"""Reward of a collision above which no lower price is proposed."""
+"""Reward of a collision nearest to zero that is proposed."""
 
 
 def describe_start(preparation: TrainingSetup, seeds: int | None) -> str:
@@ -126,13 +126,14 @@ def _of_one(summary: dict[str, Any], config: Config) -> str:
 
 
 def _hovering(summary: dict[str, Any], config: Config) -> str:
-    """Returns a line with a remedy if most validation missions ran out of time; otherwise nothing."""
+    """Returns a line with a remedy if most validation missions of an agent's run ran out of time."""
     share, price = summary.get("validation_timed_out", 0.0), round(config.env.collision_reward / 3)
     if share < HOVERS or price > LEAST_PRICE:
         return ""
+    left = f" --env.left-volume-reward {price}" if config.env.left_volume_reward < price else ""
     return (
         f"{share:.0%} ran out of time: where a collision costs much, a policy may learn to hover. Try a lower price, "
-        f"with --env.collision-reward {price} --env.left-volume-reward {price}.\n"
+        f"with --env.collision-reward {price}{left}.\n"
     )
 
 

@@ -44,7 +44,7 @@ def summarize_run(
         "first_success_seconds": since[1],
         "validation_success": result.kept.success,
         "validation_spl": result.kept.spl,
-        **({"validation_timed_out": result.kept.timed_out} if result.kept.decisions else {}),
+        **({} if result.kept.timed_out is None else {"validation_timed_out": result.kept.timed_out}),
         "parameters_from_decisions": result.kept.decisions,
         "reward": reward_record(config, reward),
         "workload": describe_workload(config, preparation.missions[0].training.scene()),

@@ -31,7 +31,7 @@ class Candidate:
     success: float = 0.0  # share of validation missions
     success_near_start: float = 0.0  # share of those that begin at or near their world's own start
     decisions: int = 0  # trained before that validation, in all environments
-    timed_out: float = 0.0  # share of validation missions
+    timed_out: float | None = None  # share of validation missions; of older runs that go on it is not known
 
 
 def is_due(config: Config, schedule: Schedule, checked: int, done: int) -> bool:

@@ -60,14 +60,16 @@ def test_a_run_ends_with_its_success_over_the_validation_missions_before_one_fli
 
 
 def test_a_run_that_ends_in_hovering_says_how_it_may_fly() -> None:
-    def second_line(share: float, price: float) -> str:
-        config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, collision_reward=price))
+    def second_line(share: float, price: float, left: float | None = None) -> str:
+        prices = {"collision_reward": price, "left_volume_reward": price if left is None else left}
+        config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, **prices))
         return verdict(ONE | {"validation_timed_out": share}, RunDirectory(Path("here")), config).splitlines()[1]
 
     assert second_line(0.62, -60.0) == (
         "62% ran out of time: where a collision costs much, a policy may learn to hover. Try a lower price, with "
         "--env.collision-reward -20 --env.left-volume-reward -20."
     )
+    assert second_line(0.62, -60.0, left=0.0).endswith("with --env.collision-reward -20.")  # none is raised
     assert second_line(0.4, -60.0).startswith("The greedy flight") and second_line(0.9, -9.0).startswith("The greedy")
 
 

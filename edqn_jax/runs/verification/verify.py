@@ -277,7 +277,7 @@ def _unverified_keys(summary: Mapping[str, Any], derived: set[str], tests: bool)
 def _from_checkpoint(saved: _Saved) -> dict[str, Any]:
     """Returns the expected training entries of `summary.json`, from the last checkpoint."""
     since = first_success([(found[0], found[1], found[2]) for found in saved.agent["validations"]])
-    has_share = "timed_out" in saved.agent  # of older versions none has
+    timed_out = saved.agent.get("timed_out")  # of older runs none has it
     return {
         "train_seconds": saved.host["train_seconds"],
         "resumed_at_decisions": saved.host["resumed_at"],
@@ -288,7 +288,7 @@ def _from_checkpoint(saved: _Saved) -> dict[str, Any]:
         "validation_success": saved.agent["success"],
         "validation_spl": saved.agent["spl"],
         "parameters_from_decisions": saved.agent["decisions"],
-        **({"validation_timed_out": saved.agent["timed_out"]} if saved.agent["decisions"] and has_share else {}),
+        **({} if timed_out is None else {"validation_timed_out": timed_out}),
     }
 
 
