@@ -41,6 +41,7 @@ import jax
 import numpy as np
 import yaml
 
+from edqn_jax.cli.process.status import show_phase
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import apply_layer, to_yaml
 from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
@@ -375,11 +376,12 @@ def measure(wanted: Sequence[Wanted], rows: list[Row], until: float, first_row_s
         ConfigError: if a row cannot be measured.
     """
     took: list[float] = []
-    for one in wanted:
+    for number, one in enumerate(wanted):
         if one.file.is_file():
             continue
         if time.perf_counter() + max(took, default=first_row_s) >= until:
             break
+        show_phase("measuring rows", number, len(wanted))
         one.file.parent.mkdir(parents=True, exist_ok=True)
         with _claim(one.file) as is_ours:
             if not is_ours or one.file.is_file():
@@ -418,13 +420,14 @@ def train_all(wanted: Sequence[Wanted], until: float) -> None:
     A row that another process trains or measures is left to it.
     """
     took: list[float] = []
-    for one in wanted:
+    for number, one in enumerate(wanted):
         if one.train is None or one.file.is_file() or (policies_of(one.file) / TRAINED).is_file():
             continue
         began = time.perf_counter()
         if began + max(took, default=FIRST_ROW_S) > until:
             print("trainings are left; the same command goes on with them", file=sys.stderr)
             return
+        show_phase("training rows", number, len(wanted))
         one.file.parent.mkdir(parents=True, exist_ok=True)
         with _claim(one.file) as is_ours:
             if not is_ours or (policies_of(one.file) / TRAINED).is_file():
