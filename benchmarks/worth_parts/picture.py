@@ -55,6 +55,7 @@ CONTRASTS = (0.05, 0.2)
 """Of the sensors whose bytes are drawn; tables have others, and more resolutions than the smallest and the largest."""
 
 HATCH, PARTIAL = "//", "hatched: not every sensor of the axis was flown"
+"""Of cells, and what the legend says of it."""
 
 MOST_NAMED = 3
 """Sensors that are named in a cell; more are counted."""

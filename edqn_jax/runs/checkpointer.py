@@ -264,7 +264,9 @@ class Checkpointer:
         ]
         agents = [
             AgentProgress(
-                kept=Candidate(params, **{name: agent[name] for name in _scores() if name in agent or name != _NEWEST}),
+                kept=Candidate(
+                    params, **{name: agent[name] for name in _scores() if name in agent or name not in _NOT_IN_OLDER}
+                ),
                 episodes=agent["episodes"],
                 validations=[(found[0], found[1], found[2]) for found in agent["validations"]],
             )
@@ -284,8 +286,8 @@ class Checkpointer:
         return standing.done * self.config.train.num_envs
 
 
-_NEWEST = "timed_out"
-"""The score that checkpoints of older runs do not have."""
+_NOT_IN_OLDER = {"timed_out"}
+"""Scores that checkpoints of older runs do not have."""
 
 
 def _scores() -> list[str]:

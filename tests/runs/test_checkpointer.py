@@ -128,6 +128,17 @@ def test_a_run_stands_where_it_stood(tmp_path: Path, clock: Clock) -> None:
     np.testing.assert_array_equal(found.state["x"], STATE["x"])  # type: ignore[index]
 
 
+def test_a_run_of_before_time_outs_were_counted_goes_on_without_their_share(
+    tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores = checkpointer._scores()
+    monkeypatch.setattr(checkpointer, "_scores", lambda: [name for name in scores if name != "timed_out"])
+    kept(tmp_path)[0].save_if_due(standing(8), last=True)
+    monkeypatch.setattr(checkpointer, "_scores", lambda: scores)
+    found = kept(tmp_path)[0].restore_newest()
+    assert found is not None and found.agents[0].kept.timed_out is None and found.agents[0].kept.success == 0.75
+
+
 def test_where_a_file_of_the_run_was_changed_the_checkpoint_before_is_used(tmp_path: Path, clock: Clock) -> None:
     made, _ = kept(tmp_path)
     made.save_if_due(standing(1), last=True)

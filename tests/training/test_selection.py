@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Literal
 
+import numpy as np
 import pytest
 
 from edqn_jax.config import Config, TrainConfig, WorldConfig
+from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.schedule import Schedule
-from edqn_jax.training.selection import Candidate, choose_candidate, first_success, is_due
+from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.training.selection import Candidate, choose_candidate, first_success, is_due, make_candidate
 
 
 @pytest.mark.parametrize(
@@ -33,6 +37,17 @@ def test_a_run_ends_with_the_parameters_of_the_best_spl_or_the_last(
         # The success rate falls all the while: it must not count.
         kept = choose_candidate(keep, kept, Candidate(params, weighted, 1 / number, decisions=100 * number))
     assert kept.decisions == ends_with
+
+
+def test_a_validation_is_scored_by_how_its_flights_ended() -> None:
+    config = make_config("paper", train={"validation_missions": 4})
+    missions = run_missions(config)
+    of_all = len(missions.validation.env_params.missions.scene)
+    ended = np.full(of_all, Outcome.TIME_OUT)
+    ended[0], ended[1] = Outcome.GOAL, Outcome.COLLISION
+    flights = SimpleNamespace(outcome=ended, path_length_m=np.full(of_all, 30.0))
+    found = make_candidate(config, missions, flights, PolicyParams(encoder={}, q={}), 64)  # type: ignore[arg-type]
+    assert (found.success, found.timed_out, found.decisions) == (1 / of_all, (of_all - 2) / of_all, 64)
 
 
 def test_a_policy_flies_the_mission_from_its_first_good_validation() -> None:

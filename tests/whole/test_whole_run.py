@@ -110,6 +110,9 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
         return {finding.what for finding in verify_run(changed.path) if finding.right is False}
 
     assert wrong() == set()
+    rewrite(changed.summary_file, '"validation_timed_out": ', '"validation_timed_out": 1')
+    assert wrong() == {"summary.json from metrics.jsonl", "summary.json from the last checkpoint"}
+    rewrite(changed.summary_file, '"validation_timed_out": 1', '"validation_timed_out": ')
     rewrite(changed.summary_file, '"path_length_m": ', '"path_length_m": 1')
     assert wrong() == {"summary.json from trajectory.csv"}
     rewrite(changed.metrics_file, '"validation_spl": ', '"validation_spl": 1')

@@ -36,9 +36,9 @@ def from_metrics(config: Config, metrics: Sequence[Mapping[str, Any]]) -> dict[s
         (row["decisions"] - before) / row["decisions_per_second"]
         for before, row in zip(decisions, metrics, strict=False)
     )
-    last = "validation_timed_out"  # which older runs do not have, nor runs without a validation
+    share = "validation_timed_out"  # which older runs do not have, nor runs without a validation
     return {
-        **({last: kept[last]} if kept and last in kept else {}),
+        **({share: kept[share]} if kept and share in kept else {}),
         "train_decisions": decisions[-1],
         "train_seconds": seconds,
         "decisions_per_second": decisions[-1] / seconds if seconds else None,
