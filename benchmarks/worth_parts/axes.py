@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import success
-from edqn_jax.config import Config
+from edqn_jax.config import Config, ExposureConfig
 
 Layer = Mapping[str, Mapping[str, Any]]
 
@@ -24,6 +24,17 @@ REAL_EVENTS = ("--events.profile", "dvs", "--events.threshold", "0.03", "--event
 REAL_FRAMES = ("--exposure.real",)
 REAL = {BLIND: (), DEPTH: (), "events": REAL_EVENTS, "frames": REAL_FRAMES, "frame-pair": REAL_FRAMES}
 """Sensors with the faults of real ones, for axes with light."""
+
+MEAN_OF = 117
+"""Pixels of a sensor of 346 x 260 under one of 32 x 24."""
+MEAN_EVENTS = ("--events.profile", "dvs", "--events.sensor-pixels", str(MEAN_OF))
+MEAN_FRAMES = (
+    *("--exposure.real", "--exposure.bits", "12", "--exposure.full-well-e", str(MEAN_OF * ExposureConfig.full_well_e)),
+    *("--exposure.sensitivity-e-lux-s", str(MEAN_OF * ExposureConfig.sensitivity_e_lux_s)),
+    *("--exposure.read-noise-e", str(MEAN_OF**0.5 * ExposureConfig.read_noise_e)),
+)
+MEAN = {BLIND: (), DEPTH: (), "events": MEAN_EVENTS, "frames": MEAN_FRAMES, "frame-pair": MEAN_FRAMES}
+"""Real sensors of one size, whose noise averages out alike: the events' thresholds are a real camera's 0.2."""
 
 LUX = (0.1, 1.0, 10.0, 100.0, 10_000.0)
 
@@ -69,6 +80,8 @@ class Axis:
     """Whether the controls see nothing of what differs between conditions of training, and are trained in one."""
     same_flown: bool = False
     """Likewise of the conditions that are flown."""
+    controls: str | None = None
+    """Another axis, of the same task, whose rows of the controls are this one's as well."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +92,16 @@ class Place:
     trained: str
     sensor: str
 
+
+DARK = Axis(
+    "Light and speed",
+    ("medium",),
+    {f"{speed:g} m/s": ("--env.speed-m-s", str(speed)) for speed in (4.0, 8.0)},
+    REAL,
+    {f"{lux:g} lux": {"light": {"least_lux": lux, "most_lux": lux}} for lux in LUX},
+    ("--light.least-lux", str(LUX[0]), "--light.most-lux", str(LUX[-1])),
+    same_flown=True,
+)
 
 AXES: dict[str, Axis] = {
     "looks": Axis(
@@ -113,15 +136,8 @@ AXES: dict[str, Axis] = {
             *("--world.ball-radii-m", *map(str, RADII_M)),
         ),
     ),
-    "dark": Axis(
-        "Light and speed",
-        ("medium",),
-        {f"{speed:g} m/s": ("--env.speed-m-s", str(speed)) for speed in (4.0, 8.0)},
-        REAL,
-        {f"{lux:g} lux": {"light": {"least_lux": lux, "most_lux": lux}} for lux in LUX},
-        ("--light.least-lux", str(LUX[0]), "--light.most-lux", str(LUX[-1])),
-        same_flown=True,
-    ),
+    "dark": DARK,
+    "size": dataclasses.replace(DARK, question="Light and speed, cameras of one size", sensors=MEAN, controls="dark"),
     "shade": Axis(
         "Sun and shade a hundred times darker",
         ("medium", "rooms"),

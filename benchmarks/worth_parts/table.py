@@ -72,15 +72,18 @@ def rivals_of(sensors: Iterable[str]) -> list[str]:
 
 
 def rows_of(rows: Iterable[success.Row], axis: str) -> list[success.Row]:
-    """Returns the rows of an axis, of those with the same name the newest.
+    """Returns the rows of an axis, of those with the same name the newest; where it has rows, with its controls.
 
     Raises:
         ConfigError: if they were not trained and flown alike.
     """
-    newest = {}
-    for row in rows:
-        if row.get("benchmark") == "worth" and row["axis"] == axis:
-            newest[tuple(row.get(key) for key in ("world", "trained", "sensor", "width", "look"))] = row
+    newest, controls = {}, AXES[axis].controls if axis in AXES else None
+    known = [row for row in rows if row.get("benchmark") == "worth"]
+    own = [row for row in known if row["axis"] == axis]
+    if own and controls:
+        own = [row for row in known if row["axis"] == controls and row["sensor"] in (BLIND, DEPTH)] + own
+    for row in own:
+        newest[tuple(row.get(key) for key in ("world", "trained", "sensor", "width", "look"))] = row
     found = list(newest.values())
     for key, said in (("decisions", "decisions"), ("missions", "missions"), ("test_seed", "test worlds")):
         if len({row.get(key) for row in found}) > 1:

@@ -104,6 +104,29 @@ def test_shade_is_trained_and_flown_without_and_with_cast_shadows() -> None:
     )  # depth and nothing do not change in the shade
 
 
+def test_cameras_of_one_size_average_equally_many_pixels() -> None:
+    axis, usual = AXES["size"], config_of(AXES["dark"], Place("medium", "8 m/s", "frames"), SMALL)
+    events, frames = (config_of(axis, Place("medium", "8 m/s", sensor), SMALL) for sensor in ("events", "frames"))
+    assert (events.events.sensor_pixels, events.events.threshold) == (117, 0.2)
+    more, less = frames.exposure, usual.exposure
+    assert (more.full_well_e / less.full_well_e, more.sensitivity_e_lux_s / less.sensitivity_e_lux_s) == (117, 117)
+    assert (more.read_noise_e / less.read_noise_e) ** 2 == pytest.approx(117)
+    assert frames.light == events.light == usual.light
+
+
+def test_controls_of_another_axis_stand_beside_sensors_that_differ_alone() -> None:
+    axis = AXES["size"]
+    at = {"axis": "dark", "trained": "8 m/s"}
+    first = dict.fromkeys(list(axis.flown)[:1], 0.25)
+    rows = [row("blind", 0.25, first, **at), row("frames", 0.5, dict.fromkeys(axis.flown, 0.5), **at)]
+    assert table.cells_of(table.rows_of(rows, "size"), axis) == []
+    rows.append(row("events", 0.75, dict.fromkeys(axis.flown, 0.75), **at | {"axis": "size"}))
+    cells = table.cells_of(table.rows_of(rows, "size"), axis)
+    assert [set(cell.arrived) for cell in cells] == [{"blind", "events"}] * len(axis.flown)
+    rows.append(row("blind", 0.5, dict.fromkeys(first, 0.5), **at | {"axis": "size"}))  # its own, where it has some
+    assert table.cells_of(table.rows_of(rows, "size"), axis)[0].arrived["blind"].mean() == 0.5
+
+
 def test_a_camera_with_a_clock_has_its_rate_and_latency_and_counts_as_frames() -> None:
     config = config_of(AXES["age"], Place("court", "0.3 to 1 s", "frame-pair@60"), SMALL)
     assert (config.env.sensor, config.exposure.rate_hz, config.exposure.latency_s) == ("frame-pair", 60, 0.015)

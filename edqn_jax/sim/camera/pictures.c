@@ -20,6 +20,7 @@
 #define LANES 8
 #endif
 #define FN static inline
+#define APART static inline
 #define UNROLLED
 #define ALIGNED
 

@@ -118,16 +118,12 @@ def test_c_draws_what_jax_draws(size: tuple[int, int]) -> None:
         assert np.isfinite(jax.vmap(partial(camera.render_luma, config))(scene, origin, rotation)).all()
 
 
-def patterned_frames(rng: np.random.Generator) -> tuple[Scene, jax.Array, jax.Array]:
-    """As many as JAX draws with one of its branches, which is quick to compile."""
-    return frames([looking(crowd(rng), seed) for seed in range(4)], 8, seed=7)
-
-
 @pytest.mark.whole
 def test_c_draws_every_pattern_as_jax_does() -> None:
     rng = np.random.default_rng(6)
     if native.is_available("cpu"):
-        agree(CONFIG, *patterned_frames(rng), ties=TIES)
+        # As many as JAX draws with one of its branches, which is quick to compile.
+        agree(CONFIG, *frames([looking(crowd(rng), seed) for seed in range(4)], 8, seed=7), ties=TIES)
 
 
 @pytest.mark.whole
@@ -286,11 +282,15 @@ def test_the_kernels_of_gpus_draw_what_c_draws_of_a_camera_on_the_body(
 
 
 @pytest.mark.whole
-def test_the_kernels_of_gpus_draw_every_pattern(kernels: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("world", [crowd, crowded_forest], ids=["known to a block", "more than a block knows"])
+def test_the_kernels_of_gpus_draw_every_pattern(
+    kernels: bool, monkeypatch: pytest.MonkeyPatch, world: Callable[..., Scene]
+) -> None:
     call = native._call
     monkeypatch.setattr(native, "_call", lambda target, *given: call(f"emulated_{target}", *given))
     if kernels:
-        agree(CONFIG, *patterned_frames(np.random.default_rng(8)), ties=TIES)
+        rng = np.random.default_rng(8)
+        agree(CONFIG, *frames([looking(world(rng), seed) for seed in range(4)], 8, seed=7), ties=TIES)
 
 
 @pytest.mark.parametrize("mount", ["level", *in_whole("body")])
