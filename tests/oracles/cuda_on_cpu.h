@@ -15,7 +15,6 @@
 #define __device__
 #define __global__
 #define __forceinline__ inline
-#define __noinline__ __attribute__((noinline))
 #define __shared__ static
 #define __align__(bytes)
 #define __launch_bounds__(threads, resident)

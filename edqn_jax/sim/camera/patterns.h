@@ -98,7 +98,7 @@ FN Phase warped(Phase p, Phase by, float amount) {
 
 FN Lanes waves(const Sight* s, const Pattern* p) {
   Lanes sum = lanes(0);
-  UNROLLED for (int i = 0; i < 4; ++i)
+  for (int i = 0; i < 4; ++i)
     if (p->share[i] != 0) sum += p->share[i] * smooth(phase_of(s, &p->row[i]));
   return sum;
 }

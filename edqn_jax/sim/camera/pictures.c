@@ -20,7 +20,6 @@
 #define LANES 8
 #endif
 #define FN static inline
-#define APART static inline
 #define UNROLLED
 #define ALIGNED
 

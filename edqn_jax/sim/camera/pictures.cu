@@ -13,15 +13,13 @@
 
 #define LANES 1
 #define FN static __device__ __forceinline__
-#define APART static __device__ __noinline__
 #define UNROLLED _Pragma("unroll")
 #define ALIGNED __align__(16)
 #define COLUMNS 32
 #define ROWS 4
 #define RESIDENT 8 /* blocks that a multiprocessor holds at once: as many as its registers allow */
 #define THREADS (COLUMNS * ROWS)
-#define AT_ONCE 12
-#define MOST_KNOWN 64 /* patterns that a block works out once; of more shapes, every pixel those that it shows */
+#define AT_ONCE 16
 #define MEASURED_AT_ONCE 32
 #define TILTED_AT_ONCE 6
 #define TILTED_RESIDENT 4
@@ -88,15 +86,6 @@ FN int gather(Gathered* g, int n, int shown) {
   return found;
 }
 
-/* Works out the patterns of all shapes, where there is room for them; else returns null. Every thread of the block calls it. */
-FN Pattern* know_patterns(const Frame* f, Pattern* patterns) {
-  const Shapes* s = &f->shapes;
-  const int many = s->boxes + s->cylinders + s->spheres + s->planes + s->fields;
-  if (!s->patterned || many > MOST_KNOWN) return 0;
-  for (int n = threadIdx.x; n < many; n += THREADS) patterns[n] = pattern_of_shape(&f->camera, s, &f->eye, n);
-  return patterns; /* there for others after the next barrier */
-}
-
 /* Where a thread's pixels are: neighbours of a warp are 8 columns wide and 4 rows high. */
 FN int column_of(int t) { return t % 8 + t / 32 % (COLUMNS / 8) * 8; }
 FN int row_of(int t) { return t / 8 % 4 + t / 128 * 4; }
@@ -106,7 +95,6 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
   __shared__ Wave waves[MOST_WAVES];
   __shared__ Gathered gathered;
   __shared__ Upright shapes[AT_ONCE];
-  __shared__ Pattern patterns[MOST_KNOWN];
   __shared__ unsigned covering[COLUMNS]; /* which of the shapes, a bit each */
   __shared__ float numbers[AT_ONCE * NUMBERS * COLUMNS];
   const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
@@ -118,7 +106,6 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
   const Eye* e = &frame.eye;
   if (t == THREADS - 1) waves_of(c, e, waves); /* in warps that have no shape of a usual scene to look at */
   if (t == THREADS - 33) light_planes(c, s, e, frame.planes);
-  Pattern* known = know_patterns(&frame, patterns);
 
   const int uprights = s->boxes + s->cylinders, across = column_of(t), column = left + across;
   const int in_image = column < c->width;
@@ -161,11 +148,11 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
             insert_side(c, numbers + (__ffs((int)left_over) - 1) * NUMBERS * COLUMNS + across, COLUMNS, row, &layers);
       }
     }
-    if (uprights == 0) __syncthreads(); /* waves, planes and patterns are there */
+    if (uprights == 0) __syncthreads(); /* waves and planes are there */
     kept = uprights <= THREADS && found <= AT_ONCE;
     if (drawn)
       batch.pictures[((int64_t)m * c->height + row) * c->width + column] =
-          blend(c, s, frame.planes, e, waves, known, 0, ahead, dz, &layers);
+          blend(c, s, frame.planes, e, waves, 0, 0, ahead, dz, &layers);
   }
 }
 

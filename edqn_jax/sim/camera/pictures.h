@@ -423,21 +423,21 @@ FN void textures(const Camera* c, const Wave* waves, const float* ahead, Lanes h
 
 /* The pattern of shape `n`: boxes, cylinders, spheres, planes, fields. */
 FN Pattern pattern_of_shape(const Camera* c, const Shapes* s, const Eye* e, int n) {
-  /* One after the other: pointers in an array would be kept in memory by GPUs. */
-  const float *place = s->box_position, *surface = s->box_surface;
-  int others = s->boxes;
-  if (n >= others) place = s->cylinder_position, surface = s->cylinder_surface, n -= others, others = s->cylinders;
-  if (n >= others) place = s->sphere_position, surface = s->sphere_surface, n -= others, others = s->spheres;
-  if (n >= others) place = s->plane_position, surface = s->plane_surface, n -= others, others = s->planes;
-  if (n >= others) place = s->field_position, surface = s->field_surface, n -= others;
+  const int counts[5] = {s->boxes, s->cylinders, s->spheres, s->planes, s->fields};
+  const float* places[5] = {s->box_position, s->cylinder_position, s->sphere_position, s->plane_position,
+                            s->field_position};
+  const float* surfaces[5] = {s->box_surface, s->cylinder_surface, s->sphere_surface, s->plane_surface,
+                              s->field_surface};
   float right[3], up[3];
   UNROLLED for (int i = 0; i < 3; ++i) right[i] = e->right[i] * c->pitch, up[i] = e->up[i] * c->pitch;
-  return pattern_of(surface + SURFACE_NUMBERS * n, place + 3 * n, e->origin, right, up, e->up);
+  int kind = 0;
+  while (kind < 4 && n >= counts[kind]) n -= counts[kind++];
+  return pattern_of(surfaces[kind] + SURFACE_NUMBERS * n, places[kind] + 3 * n, e->origin, right, up, e->up);
 }
 
 /* Returns the relative albedo of the shapes that LANES rays meet, 1 where their number is negative. Patterns that were
  * found are kept in `known`, by shape, where that is not null. */
-APART Lanes albedo_of(const Camera* c, const Shapes* s, const Eye* e, Pattern* known, const Sight* sight, Lanes shape) {
+FN Lanes albedo_of(const Camera* c, const Shapes* s, const Eye* e, Pattern* known, const Sight* sight, Lanes shape) {
   Lanes factor = lanes(1);
   for (float n = highest(shape); n >= 0; n = highest(shape)) {
     Pattern one, *p = known ? &known[(int)n] : &one;

@@ -122,7 +122,7 @@ FN Lanes ambient_of(const Camera* c, const Shapes* s, const Eye* e, Lanes shape)
 
 /* Of what LANES rays at heights `high` of a column meet at `depth`: `value`, or where the sun does not reach it the
  * brightness of `coverage` under the ambient light. */
-APART Lanes shaded(const Camera* c, const Shapes* s, const Eye* e, const Caster* casters, const float* ahead, Lanes high,
+FN Lanes shaded(const Camera* c, const Shapes* s, const Eye* e, const Caster* casters, const float* ahead, Lanes high,
                 Lanes depth, Lanes shape, Lanes coverage, Lanes value) {
   const Lanes x = e->origin[0] + depth * (ahead[0] + e->up[0] * high);
   const Lanes y = e->origin[1] + depth * (ahead[1] + e->up[1] * high);

@@ -282,7 +282,7 @@ def test_the_kernels_of_gpus_draw_what_c_draws_of_a_camera_on_the_body(
 
 
 @pytest.mark.whole
-@pytest.mark.parametrize("world", [crowd, crowded_forest], ids=["known to a block", "more than a block knows"])
+@pytest.mark.parametrize("world", [crowd, crowded_forest], ids=["usual", "several passes"])
 def test_the_kernels_of_gpus_draw_every_pattern(
     kernels: bool, monkeypatch: pytest.MonkeyPatch, world: Callable[..., Scene]
 ) -> None:
