@@ -32,6 +32,9 @@ COLOURS = {
 }
 """By verdict; those of the bytes are `events`, `frames` and `no difference`."""
 
+DEEP = {verdict for verdict, colour in COLOURS.items() if colour in ("#3f7fbf", "#7f6fc4", "#009e73")}
+"""Verdicts whose colours want light letters."""
+
 LABELS = {
     "events": "events lead (bytes: events cost less)",
     "frames": "one frame leads (bytes: frames cost less)",
@@ -168,7 +171,11 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         x, y = panel.columns.index(column), panel.rows.index(row)
         hatch = HATCH if (row, column) in panel.partial else None
         axes.add_patch(Rectangle((x, y), 1, 1, facecolor=COLOURS[who], edgecolor="white", linewidth=1.5, hatch=hatch))
-        axes.text(x + 0.5, y + 0.5, said, ha="center", va="center", fontsize=6.5, color=INK, linespacing=1.3)
+        ink = "white" if who in DEEP else INK
+        under = {"facecolor": COLOURS[who], "edgecolor": "none", "pad": 1} if hatch else None
+        axes.text(
+            x + 0.5, y + 0.5, said, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.3, bbox=under
+        )
     axes.set_xlim(0, len(panel.columns))
     axes.set_ylim(len(panel.rows), 0)
     axes.set_xticks([x + 0.5 for x in range(len(panel.columns))], panel.columns, fontsize=7)
