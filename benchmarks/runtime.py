@@ -36,6 +36,7 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import suggest_nearest, to_yaml
 from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.metrics import format_duration
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
 from measurement.flags import parse_config as for_timing
@@ -319,7 +320,7 @@ def measure_world(asked: Asked, world: str) -> Iterator[list[Row]]:
             done = seed - args.first_seed + 1
             left = (time.perf_counter() - began) / done * (args.seeds - done)
             yield list(rows.values())
-            tell(f"{world}: seed {seed} is done, about {left / 60:.0f} min left")
+            tell(f"{world}: seed {seed} is done" + (f", about {format_duration(left)} left" if left else ""))
 
 
 def measure_rates(asked: Asked) -> dict[str, Any] | None:

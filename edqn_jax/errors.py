@@ -5,6 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+LIKE = 0.6
+"""Similarity (difflib's) from which a word is taken for another one misspelt: below it `radar` is `frame-pair`."""
+
 
 def error_sentence(error: Exception) -> str:
     """Returns what an error says in one line, with escapes in place of what no line can show, as in names of files."""
@@ -12,10 +15,10 @@ def error_sentence(error: Exception) -> str:
 
 
 def suggest_nearest(word: object, known: Iterable[str], or_else: str = "") -> str:
-    """Returns `; did you mean '...'?` with the closest known word, else a list of the known words and `or_else`."""
+    """Returns `; did you mean '...'?` with the closest known word, else a list of them; `or_else` after both."""
     known = list(known)
-    close = difflib.get_close_matches(str(word), known, n=1, cutoff=0.5)
-    return f"; did you mean '{close[0]}'?" if close else f"; known are {', '.join(known)}{or_else}"
+    close = difflib.get_close_matches(str(word), known, n=1, cutoff=LIKE)
+    return f"; did you mean '{close[0]}'{or_else}?" if close else f"; known are {', '.join(known)}{or_else}"
 
 
 class ConfigError(ValueError):

@@ -21,6 +21,7 @@ ORDER = (
         "checks",
         "extras",
         "user_code",
+        "watchers",
         "registries",
         "xla_flags",
         "xla",

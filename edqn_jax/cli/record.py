@@ -15,7 +15,7 @@ from edqn_jax.cli.arguments import Point, check_run, parse_arguments, print_note
 from edqn_jax.cli.help import RECORD
 from edqn_jax.cli.process.status import show_phase
 from edqn_jax.errors import ConfigError
-from edqn_jax.files import EVENT_FILES, VIDEO, check_shown
+from edqn_jax.files import EVENT_FILES, VIDEO, check_can_write, check_shown
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
     check_shown(args.file, args.size, args.speed, args.fps)
     if suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ConfigError("an .mp4 needs imageio_ffmpeg; run pip install 'edqn-jax[video]', or write a .gif")
+    check_can_write(args.file)
     check_run(args.run)
     return args
 

@@ -299,7 +299,8 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
 
 def _open_progress(writes: bool) -> Progress:
     """Returns what shows the progress of a run, in place of the status where that is a panel with clocks of its own."""
-    from edqn_jax.training.progress import Progress, has_panel
+    from edqn_jax.training.progress import Progress
+    from edqn_jax.watchers import has_panel
 
     console = Console(quiet=not writes)
 

@@ -27,6 +27,7 @@ from edqn_jax.policies.unseen import describe_unseen
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.watchers import shown_phases
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +97,7 @@ def evaluate(
         conditions: wind and other disturbances, and drones, in place of the policy's own, by group, such as
             `{"air": {"gusts_m_s": 5.0}}`; see `config.CONDITIONS`.
         phase: called with the name of each phase as it begins, such as `compiling`, and while it flies with how many
-            missions have ended, of how many.
+            missions have ended, of how many. Without it a terminal shows them with a clock.
         announce: called with the missions before they are flown; their `note` says what the policy never met.
 
     Raises:
@@ -111,24 +112,25 @@ def evaluate(
     actor = actor_of(policy, config)
     if decoder:
         check_predicts_distance(config, actor)
-    show = phase or show_nothing
-    show("preparing worlds")
-    loaded = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
-    mission_set = note_unseen(policy, config, loaded)
-    announce(mission_set)
-    flights = fly_on_all_devices(
-        config,
-        mission_set.env_params,
-        policy.params,
-        seed,
-        actor=actor,
-        record=record,
-        shuffle_codes=shuffle_codes,
-        decoder_errors=decoder,
-        phase=phase,
-    )
-    show("shortest paths")
-    shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
+    with shown_phases(phase) as told:
+        show = told or show_nothing
+        show("preparing worlds")
+        loaded = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
+        mission_set = note_unseen(policy, config, loaded)
+        announce(mission_set)
+        flights = fly_on_all_devices(
+            config,
+            mission_set.env_params,
+            policy.params,
+            seed,
+            actor=actor,
+            record=record,
+            shuffle_codes=shuffle_codes,
+            decoder_errors=decoder,
+            phase=told,
+        )
+        show("shortest paths")
+        shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
     return Evaluation(mission_set, flights, _figures(config, flights, shortest))
 
 

@@ -303,7 +303,7 @@ def load_missions(
             no path for the only mission.
     """
     if missions < 1:
-        raise ConfigError(f"--missions must be at least 1, not {missions}")
+        raise ConfigError(f"missions must be at least 1, not {missions}")
     check_seed(seed, missions)
     moved = moved_ends(start, goal)
     if group.is_multi_drone(config):
@@ -340,7 +340,7 @@ def check_group(config: Config, name: str, missions: int, moved: dict[str, jax.A
     if name not in FAMILIES:
         raise ConfigError(f"env.drones {drones} needs a random world ({', '.join(FAMILIES)}), not '{name}'")
     if missions % drones:
-        raise ConfigError(f"--missions must be a multiple of env.drones ({drones}), not {missions}")
+        raise ConfigError(f"missions must be a multiple of env.drones ({drones}), not {missions}")
     if moved:
         raise ConfigError(f"--{' and --'.join(moved)} cannot be given with env.drones {drones}: their missions cross")
 

@@ -23,6 +23,7 @@ from edqn_jax.policies.functions import Function, FunctionPolicy, actor_of, as_p
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.watchers import shown_phases
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +49,7 @@ def record(
     seed: int = 0,
     size: tuple[int, int] | None = None,
     pace: tuple[float | None, float | None] = (None, None),
-    phase: ShowPhase = show_nothing,
+    phase: ShowPhase | None = None,
     announce: Callable[[MissionSet], None] = lambda _: None,
 ) -> Recorded:
     """Flies a policy once and writes the flight, in place of a file of that name.
@@ -64,7 +65,8 @@ def record(
             policy's.
         pace: of a video: how many times as fast as flown it is (None: a frame a decision, or fewer), and its frames a
             second (None: 10).
-        phase: called as each phase begins, and after each frame that is drawn.
+        phase: called as each phase begins, and after each frame that is drawn. Without it a terminal shows them with a
+            clock.
         announce: called with the mission before it is flown; its `note` says what the policy never met.
 
     Raises:
@@ -81,16 +83,18 @@ def record(
     config = config_of(policy)
     # Of several drones the whole group is flown, and the first one's flight is shown.
     own = config.world.name if group.is_multi_drone(config) else config.world.flown or config.world.name
-    phase("preparing the world")
-    loaded = load_missions(config, str(world or own), config.env.drones, seed, start, goal)
-    missions = note_unseen(policy, config, loaded)
-    announce(missions)
-    if suffix in VIDEO:
-        given = {"size": size, "speed": pace[0], "fps": pace[1]}
-        film = {name: value for name, value in given.items() if value is not None}
-        flights = _write_video(file, policy, config, missions, seed, phase, **film)
-    else:
-        flights = _write_events(file, policy, config, missions, seed, size, phase)
+    with shown_phases(phase) as told:
+        show = told or show_nothing
+        show("preparing the world")
+        loaded = load_missions(config, str(world or own), config.env.drones, seed, start, goal)
+        missions = note_unseen(policy, config, loaded)
+        announce(missions)
+        if suffix in VIDEO:
+            given = {"size": size, "speed": pace[0], "fps": pace[1]}
+            film = {name: value for name, value in given.items() if value is not None}
+            flights = _write_video(file, policy, config, missions, seed, show, **film)
+        else:
+            flights = _write_events(file, policy, config, missions, seed, size, show)
     return Recorded(_ending(flights), float(flights.flight_seconds[0]), missions)
 
 

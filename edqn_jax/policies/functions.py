@@ -157,6 +157,8 @@ def as_policy(policy: Policy | FunctionPolicy | Function, world: str | Path | No
     """
     if isinstance(policy, Policy):
         return policy
+    if isinstance(policy, str | Path):
+        raise ConfigError(f"a policy is {TAKES}, or what edqn_jax.load_policy('{policy}') returns, not its name")
     own = policy if isinstance(policy, FunctionPolicy) else FunctionPolicy(policy)
     if own.config is None:
         return dataclasses.replace(own, config=make_config(None if world is None else str(world)))

@@ -118,11 +118,7 @@ def _of_one(summary: dict[str, Any], config: Config) -> str:
             f"\nUnseen test worlds: {test['successes']} of {test['missions']} reached the goal "
             f"({test['success_rate']:.0%}, 95 % Wilson interval {low:.0%} to {high:.0%})."
         )
-    return (
-        f"{text}\nTook {format_duration(summary['total_seconds'])} in all, "
-        f"{format_duration(summary['train_seconds'])} of it training. "
-        "Everything is in"
-    )
+    return f"{text}\nTook {_durations(summary)}. Everything is in"
 
 
 def _hovering(summary: dict[str, Any], config: Config) -> str:
@@ -148,9 +144,16 @@ def _of_seeds(summary: dict[str, Any]) -> str:
     return (
         f"Reached the goal in {missions}: {each}.\nInterquartile mean {summary['success_iqm']:.1%}, mean "
         f"{summary['success_mean']:.1%} (95 % interval {low:.1%} to {high:.1%}).{last if has_final_world else ''}\n"
-        f"Took {format_duration(summary['total_seconds'])} in all, "
-        f"{format_duration(summary['train_seconds'])} of it training. Each seed's "
-        "run is in"
+        f"Took {_durations(summary)}. Each seed's run is in"
+    )
+
+
+def _durations(summary: dict[str, Any]) -> str:
+    """Returns how long a run took, over all of its sessions where it was continued."""
+    sessions = ", over all of its sessions" if summary.get("resumed_at_decisions") else ""
+    return (
+        f"{format_duration(summary['total_seconds'])} in all, "
+        f"{format_duration(summary['train_seconds'])} of it training{sessions}"
     )
 
 

@@ -21,6 +21,7 @@ from rich.text import Text
 from edqn_jax.evaluation.metrics import format_duration
 from edqn_jax.evaluation.rollouts import ShowPhase, show_nothing
 from edqn_jax.learn.learner import learner_metrics
+from edqn_jax.watchers import has_panel, is_watched
 
 SHOWN = {
     "decisions_per_second": ("decisions/s", "{:,.0f}"),
@@ -252,11 +253,6 @@ class Progress:
         return Panel(Group(head, values) if shown else head, title="edqn", title_align="left")
 
 
-def has_panel(console: Console) -> bool:
-    """Returns whether a console shows a panel that is drawn anew, as notebooks and most terminals can."""
-    return console.is_jupyter or (console.is_terminal and not console.is_dumb_terminal)
-
-
 @contextlib.contextmanager
 def shown_progress(progress: bool | None) -> Iterator[Progress | None]:
     """Shows within the block, on standard error or below a notebook's cell, what a training in Python does.
@@ -269,7 +265,7 @@ def shown_progress(progress: bool | None) -> Iterator[Progress | None]:
     """
     console = Console(stderr=True)
     if progress is None:
-        progress = has_panel(console) and (console.is_jupyter or sys.stderr.isatty())  # FORCE_COLOR is no terminal
+        progress = is_watched(console)
     if not progress:
         yield None
         return

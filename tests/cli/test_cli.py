@@ -172,7 +172,7 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--env.actions", "velocity"], "env.actions must be moves for training, not velocity"),
         (
             ["train", "--env.actions", "move"],
-            "there is no set of actions 'move'; did you mean 'moves'?",
+            "there is no set of actions 'move'; did you mean 'moves', or one that --import registers?",
         ),
         (["train", "--agent.bach-size", "64"], "--agent.batch-size"),
         (["train", "--train.num-envs", "many"], "--train.num-envs must be a whole number, not 'many'"),

@@ -345,3 +345,8 @@ def test_an_encoder_flies_with_as_many_attitudes_as_it_was_trained_with(exposure
         actor_of(policy, flown)
     assert isinstance(actor_of(policy, with_conditions(trained, {"air": {"gusts_m_s": 1.0}}, "test")), AgentActor)
     assert isinstance(actor_of(FunctionPolicy(lambda observation, memory, key: (0, memory)), flown), FunctionActor)
+
+
+def test_the_name_of_a_policy_is_answered_with_how_it_is_loaded() -> None:
+    with pytest.raises(ConfigError, match=r"or what edqn_jax.load_policy\('pretrained'\) returns, not its name$"):
+        edqn_jax.evaluate("pretrained")  # type: ignore[arg-type]

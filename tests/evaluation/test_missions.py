@@ -92,7 +92,7 @@ def inside_a_block() -> tuple[float, float, float]:
     [
         ({"name": "papper"}, "there is no scene 'papper'"),
         ({"name": "nowhere/file.xml"}, "there is no scene file 'file.xml'"),
-        ({"name": "paper", "missions": 0}, "--missions must be at least 1"),
+        ({"name": "paper", "missions": 0}, "missions must be at least 1"),
         ({"name": "paper", "seed": -1}, "--seed must be from 0"),
         ({"name": "sparse", "missions": 4, "seed": 2**30}, "--seed must be from 0"),
         ({"name": "paper", "start": (float("nan"), 1, 3)}, "--start must be three finite numbers, metres, not nan 1 3"),

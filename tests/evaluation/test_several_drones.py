@@ -129,7 +129,7 @@ def test_a_run_is_validated_and_judged_by_whole_groups_the_first_of_them_in_the_
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"missions": 6}, "--missions must be a multiple of env.drones (4), not 6"),
+        ({"missions": 6}, "missions must be a multiple of env.drones (4), not 6"),
         ({"world": "paper", "missions": 8}, "env.drones 4 needs a random world"),
         ({"missions": 4, "start": (5.0, 5.0, 5.0)}, "--start cannot be given with env.drones 4: their missions cross"),
     ],

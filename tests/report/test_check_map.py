@@ -32,7 +32,7 @@ def test_the_tightest_place_is_marked_on_the_map_and_measured_in_a_level_section
     figure = drawn(tmp_path, box((5.9, 0, 0), (6.1, 5.2, 6)), box((5.9, 6.6, 0), (6.1, 12, 6)))
     assert (tmp_path / "map.png").read_bytes().startswith(b"\x89PNG")
     above, section, profile = figure.axes
-    assert [text.get_text() for text in above.texts if text.get_color() == TIGHT_COLOUR] == ["tightest"]
+    assert [text.get_text() for text in above.texts if text.get_color() == TIGHT_COLOUR] == ["tightest: shown right"]
     assert section.get_title("left") == "tightest: 0.70 m, 1.9 body radii"
     assert "section at z = 3.0 m" in section.get_xlabel()
     (x, y, room), (*_, body) = circles(figure, 1)

@@ -59,6 +59,14 @@ def test_a_run_ends_with_its_success_over_the_validation_missions_before_one_fli
     )
 
 
+def test_the_time_of_a_run_that_was_continued_is_said_to_be_that_of_all_its_sessions() -> None:
+    run = RunDirectory(Path("here"))
+    for summary in (ONE, SEEDS):
+        assert "Took 1:10 in all, 1:00 of it training. " in verdict(summary, run, CONFIG)
+        continued = verdict({**summary, "resumed_at_decisions": [2048]}, run, CONFIG)
+        assert "Took 1:10 in all, 1:00 of it training, over all of its sessions. " in continued
+
+
 def test_a_run_that_ends_in_hovering_says_how_it_may_fly() -> None:
     def second_line(share: float, price: float, left: float | None = None) -> str:
         prices = {"collision_reward": price, "left_volume_reward": price if left is None else left}

@@ -16,7 +16,8 @@ from rich.console import Console
 from edqn_jax.errors import ConfigError
 from edqn_jax.training import progress as module
 from edqn_jax.training.loop import train, train_seeds
-from edqn_jax.training.progress import Progress, format_duration, has_panel, shown_progress
+from edqn_jax.training.progress import Progress, format_duration, shown_progress
+from edqn_jax.watchers import has_panel
 from tests.support.configs import BLIND_RUN
 from tests.support.processes import PATIENCE_S
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.config import Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import MissionSet, final_missions
 from edqn_jax.evaluation.rollouts import ShowPhase, fly_on_all_devices
@@ -90,6 +90,11 @@ def fly_run(
         raise ConfigError(f"a file of the run in '{folder}' is not as a run writes it: {error}"[:300]) from None
     missions, flights = _evaluate(config, params, AgentActor(config), most, f"'{folder}'", message, phase)
     count, notes = len(flights.outcome), worlds_replaced(folder)
+    if config.world.name not in FAMILIES and count > 1 and config.train.keep == "best":
+        notes.append(
+            "All flights but the first are of the run's validation, by which its policy was chosen among others; edqn "
+            "evaluate flies others."
+        )
     if count < config.train.validation_missions:
         notes.append(f"{count} of the run's {config.train.validation_missions} evaluation flights are on this page.")
     ended = Outcome(int(flights.outcome[0])).name.lower()

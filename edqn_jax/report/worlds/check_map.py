@@ -101,7 +101,7 @@ def _mark(axes: Axes, place: np.ndarray, reach: float) -> None:
     """Marks the part of the map that the section shows, around `place` [2] metres."""
     axes.add_patch(Circle((place[0], place[1]), reach, fill=False, ec=TIGHT_COLOUR, lw=1.4, zorder=8))
     axes.annotate(
-        "tightest",
+        "tightest: shown right",
         (place[0], place[1] + reach),
         xytext=(0, 3),
         textcoords="offset points",
