@@ -32,7 +32,7 @@ def all_sum(tree: Tree, axis: str | None, after: Any) -> Tree:
     leaves, form = jax.tree.flatten(tree)
     count = lax.axis_size(axis)
     plain = all(leaf.dtype in (jnp.float32, jnp.int32) for leaf in leaves)
-    if count == 1 or not plain or jax.default_backend() != "cpu" or jax.process_count() > 1 or not _is_available():
+    if count == 1 or not plain or jax.default_backend() != "cpu" or jax.process_count() > 1 or not is_available():
         return lax.psum(tree, axis)
     shapes = [jax.ShapeDtypeStruct(jnp.shape(leaf), leaf.dtype) for leaf in leaves]
     call = jax.ffi.ffi_call("edqn_all_sum", shapes, vmap_method="broadcast_all")
@@ -40,5 +40,6 @@ def all_sum(tree: Tree, axis: str | None, after: Any) -> Tree:
     return jax.tree.unflatten(form, call(lax.axis_index(axis), jnp.int32(count), first, *leaves))
 
 
-def _is_available() -> bool:
+def is_available() -> bool:
+    """Returns whether the library is loaded and registered, which the first call does."""
     return ensure_registered(SOURCE, ("edqn_all_sum",))

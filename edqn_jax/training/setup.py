@@ -29,8 +29,10 @@ from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.learn.state import TrainState
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.learn.updates import check_begins
+from edqn_jax.native import all_sum, products
 from edqn_jax.planning.astar import Path as ShortestPath
 from edqn_jax.planning.astar import kept_shortest_path
+from edqn_jax.sim.camera import native as drawing
 from edqn_jax.sim.task.env import check_sensor
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward, check_reward
@@ -106,6 +108,7 @@ class TrainingSetup:
         self.start = start
         display.phase("preparing worlds")
         self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)
+        pool.submit(_load_libraries)  # where they are not kept, compilers need no Python, and worlds no libraries
         # A world's file may be missing on one host.
         self.missions = processes.run_synchronised(lambda: missions_of_runs(self.configs, reward))
         worlds = [missions.training.env_params for missions in self.missions]
@@ -217,6 +220,13 @@ def set_up_training(
         yield TrainingSetup(config, reward, display or Silent(), pool, agents, start)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _load_libraries() -> None:
+    """Has what nearly every program calls in C or CUDA compiled, unless it is kept."""
+    drawing.is_available("cpu" if jax.default_backend() == "cpu" else "cuda")
+    products.is_available()
+    all_sum.is_available()
 
 
 def _in_background(pool: Executor, work: Callable[[], Made]) -> Future[Made]:

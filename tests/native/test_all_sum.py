@@ -78,6 +78,6 @@ def test_a_device_that_is_late_is_waited_for(late: int) -> None:
 
 
 def test_where_it_is_not_at_hand_xla_adds(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_is_available", lambda: False)
+    monkeypatch.setattr(module, "is_available", lambda: False)
     text = spread(lambda x: all_sum(x, "d", 0.0)).lower(arrays(0)).as_text()
     assert "all_reduce" in text and "edqn_all_sum" not in text

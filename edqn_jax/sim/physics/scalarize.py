@@ -224,9 +224,31 @@ _LAYOUT: dict[str, Callable[..., Numbers]] = {
 _NUMPY: dict[str, Callable[..., Numbers]] = {
     **{"add": np.add, "sub": np.subtract, "mul": np.multiply, "max": np.maximum, "min": np.minimum, "neg": np.negative},
     **{"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal},
-    **{"ne": np.not_equal, "and": np.bitwise_and, "or": np.bitwise_or, "rem": np.fmod},
+    **{"ne": np.not_equal, "and": np.bitwise_and, "or": np.bitwise_or, "rem": np.fmod, "sign": np.sign, "abs": np.abs},
+    "is_finite": np.isfinite,
 }
 """NumPy functions for constant operands, mostly indices; XLA would compile a program for each shape."""
+
+
+def _iota(params: dict[str, Any]) -> Numbers:
+    along = [1] * len(params["shape"])
+    along[params["dimension"]] = -1
+    counted = np.arange(params["shape"][params["dimension"]], dtype=params["dtype"])
+    return np.broadcast_to(counted.reshape(along), params["shape"])
+
+
+def _cumsum(params: dict[str, Any], x: Numbers) -> Numbers:
+    turn = np.flip if params["reverse"] else lambda each, axis: each
+    return turn(np.cumsum(turn(x, params["axis"]), params["axis"], dtype=x.dtype), params["axis"])
+
+
+_OF_WHOLE_NUMBERS: dict[str, Callable[..., Numbers]] = {
+    "iota": _iota,
+    "convert_element_type": lambda params, x: x.astype(params["new_dtype"]),
+    "cumsum": _cumsum,
+    "reduce_sum": lambda params, x: x.sum(tuple(params["axes"]), dtype=x.dtype),
+}
+"""Likewise, of whole numbers and truths alone, of which no result is rounded; of others XLA's is taken."""
 
 _ELEMENTWISE = frozenset(
     "abs add add_any and atan2 clamp convert_element_type cos div eq exp floor ge gt integer_pow is_finite le log lt "
@@ -239,6 +261,8 @@ def _fold_constants(equation: Any, operands: Sequence[Any]) -> list[Numbers]:
     name = equation.primitive.name
     if name in _NUMPY:
         return [_NUMPY[name](*operands)]
+    if name in _OF_WHOLE_NUMBERS and all(each.dtype.kind in "biu" for each in operands):
+        return [_OF_WHOLE_NUMBERS[name](equation.params, *operands)]
     if name == "select_n":
         return [np.choose(np.asarray(operands[0], int), operands[1:])]
     with jax.ensure_compile_time_eval():
