@@ -29,7 +29,7 @@ from edqn_jax.sim.task.env import EnvParams, EnvState, Step, scene_of
 from edqn_jax.sim.task.flights import Flights, Record, at_start, update_tallies
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome
-from edqn_jax.sim.task.task import task_of
+from edqn_jax.sim.task.task import shaped_task, task_of
 
 
 class ShowPhase(Protocol):
@@ -340,7 +340,8 @@ def _begin(program: _Program, env_params: EnvParams, params: Any, number: Array,
     # The first decision resets every environment: the observation and the action before it are not used.
     state = jax.vmap(partial(task.begin, env_params))(keys, number)
     actions = jnp.zeros((missions, *action.shape), action.dtype)
-    seen = jax.eval_shape(task.map(partial(task.step, env_params)), state, actions)[1].observation
+    shaped = shaped_task(config)
+    seen = jax.eval_shape(shaped.map(partial(shaped.step, env_params)), state, actions)[1].observation
     return _Flying(
         state=state,
         observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),

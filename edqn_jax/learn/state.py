@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 from typing import NamedTuple
 
@@ -26,7 +25,7 @@ from edqn_jax.learn.updates import Networks, init_networks
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.env import EnvParams, EnvState
 from edqn_jax.sim.task.outcomes import Outcome
-from edqn_jax.sim.task.task import task_of
+from edqn_jax.sim.task.task import shaped_task, task_of
 
 NO_START = int(Outcome.TIME_OUT)
 """Outcome in the replay of a row at which no transition starts, as where an episode has ended."""
@@ -148,9 +147,7 @@ def _empty_samples(config: Config, env_params: EnvParams, state: EnvState) -> Sa
     """Returns the rings [S, L, E, ...] of what the VAE learns from; None where there is no VAE."""
     if not embedding.has_code(config):
         return None
-    # Only shapes are wanted, which no physics changes, and the closed form is traced in a third of MJX's time.
-    quick = dataclasses.replace(config, drone=dataclasses.replace(config.drone, physics="rigid_body"))
-    task, shards, envs = task_of(quick), config.train.shards, config.train.num_envs
+    task, shards, envs = shaped_task(config), config.train.shards, config.train.num_envs
 
     def one(state: EnvState) -> Samples:
         step = task.step(env_params, state, task.still)[1]

@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar
 
 import jax
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config
 from edqn_jax.config.rules import check_learns, validate
@@ -125,7 +125,7 @@ class TrainingSetup:
         self._compiled = _in_background(pool, lambda: _timed(self.trainer.compile, began))
         world, key = self._placed(self.missions[0].validation.env_params), run_streams(config.train.seed).flights
         compile_flights = rollouts.trace_missions(
-            *(config, world, lambda: self._placed(fresh_policy(config)), key),
+            *(config, world, self._shaped_policy, key),
             extras=rollouts.Extras(record=True),
             mesh=self.mesh,
         )
@@ -168,6 +168,12 @@ class TrainingSetup:
 
     def _shortest(self) -> ShortestPath:
         return kept_shortest_path(self.missions[0].scene, self.config.drone.body_radius_m)
+
+    def _shaped_policy(self) -> PolicyParams:
+        """Returns the shapes and layout of what will fly."""
+        everywhere = NamedSharding(self.mesh, PartitionSpec())
+        shaped = jax.eval_shape(lambda: fresh_policy(self.config))
+        return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=everywhere), shaped)
 
     def _placed(self, tree: Tree) -> Tree:
         """Returns arrays as `fly_missions` takes them."""

@@ -60,6 +60,14 @@ class Task:
     """(own states [..., own_size], quarter turns [...]) → those of world and drone turned about the vertical."""
 
 
+def shaped_task(config: Config) -> Task:
+    """Returns a task for `jax.eval_shape`: its arrays have the shapes of the configured one's, which is slow to trace.
+
+    No physics changes a shape, and the closed form is traced in a third of MJX's time.
+    """
+    return task_of(dataclasses.replace(config, drone=dataclasses.replace(config.drone, physics="rigid_body")))
+
+
 @functools.cache
 def task_of(config: Config) -> Task:
     """Returns the task that a configuration describes.

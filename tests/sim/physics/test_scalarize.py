@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 
 from edqn_jax.config import Config
 from edqn_jax.sim.physics.airframe import load_airframe
@@ -74,7 +75,21 @@ def of_constants(a, b):
     )
 
 
-@pytest.mark.parametrize("function", [turned, picked, written, chosen, reduced, smooth, of_constants])
+def of_whole_numbers(a, b):
+    del b
+    counted = lax.broadcasted_iota(jnp.int32, (3, 2), 0)
+    truths = jnp.asarray(TABLE) > 0
+    return (
+        jnp.cumsum(counted, 0)[jnp.cumsum(truths[0])] * 1.5,
+        lax.cumsum(counted, 1, reverse=True),
+        truths.sum(0) + counted.sum(),
+        counted.astype(jnp.uint8).sum((0, 1), dtype=jnp.uint8) * jnp.uint8(200),
+        truths.astype(jnp.float32) @ a,
+        jnp.sign(jnp.abs(counted - 1)) - jnp.isfinite(TABLE[0]).sum(),
+    )
+
+
+@pytest.mark.parametrize("function", [turned, picked, written, chosen, reduced, smooth, of_constants, of_whole_numbers])
 def test_the_results_are_those_of_the_function(function: Callable) -> None:
     rng = np.random.default_rng(0)
     for batch in ((), (5,)):
