@@ -429,7 +429,7 @@
         { ...AXIS, size: 48, space: 18, values: (_, ticks) => ticks.map(format) },
       ],
       series: [{}, ...lines.map((line) => ({
-        label: line.label, stroke: line.colour, width: 1.6, dash: line.dash, spanGaps: true, points: { show: line.x.length < 2 },
+        label: line.label, stroke: line.colour, width: 1.6, dash: line.dash, spanGaps: true, points: { show: Boolean(line.dash) || line.x.length < 2 },
       }))],
     }, [xs, ...rows], box);
     charts.push({ plot, box, height });
@@ -496,6 +496,12 @@
     const flights = data.runs.flatMap((run) => run.flights
       .filter((flight) => flight.world === here.world && (others.checked || flight === here))
       .map((flight) => ({ flight, colour: several ? run.colour : flight === here ? "#0072b2" : data.outcomes[flight.outcome].colour })));
+    const ends = several ? [] : [...new Set(flights.filter((each) => each.flight !== here).map((each) => each.flight.outcome))];
+    byId("colours").replaceChildren(...ends.map((kind) => {
+      const word = make("span", `● ${data.outcomes[kind].label} `);
+      word.style.color = data.outcomes[kind].colour;
+      return word;
+    }));
     view?.show(here.world, flights, here);
   }
 
