@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import Progress, TextColumn, TimeElapsedColumn
+if TYPE_CHECKING:  # rich is imported where something is shown: commands show their first line before
+    from rich.console import Console
+
+_takers: list[str] = []
+"""Titles of what shows phases on standard error already, as commands do."""
 
 
 def has_panel(console: Console) -> bool:
@@ -21,17 +25,32 @@ def is_watched(console: Console) -> bool:
 
 
 @contextlib.contextmanager
+def taken(title: str) -> Iterator[None]:
+    """Keeps `shown_phases` from showing a line of its own within the block: something of this title shows phases."""
+    _takers.append(title)
+    try:
+        yield
+    finally:
+        _takers.remove(title)
+
+
+@contextlib.contextmanager
 def shown_phases(phase: Callable[..., None] | None) -> Iterator[Callable[..., None] | None]:
     """Yields what is told of phases within the block: `phase`, or where there is none a line with a clock.
 
-    The line is on a terminal alone, and gone afterwards; elsewhere None is yielded: a notebook would keep it.
+    The line is on a terminal alone, unless something else shows phases there, and gone afterwards. Elsewhere None is
+    yielded: a notebook would keep it.
     """
+    from rich.console import Console
+    from rich.progress import Progress, TextColumn, TimeElapsedColumn
+
     console = Console(stderr=True)
-    if phase is not None or console.is_jupyter or not is_watched(console):
+    if phase is not None or _takers or console.is_jupyter or not is_watched(console):
         yield phase
         return
     columns = TextColumn("  {task.description}"), TextColumn("{task.fields[count]}"), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True) as shown:
+    # What is printed meanwhile to a file stays there.
+    with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as shown:
         line = shown.add_task("starting", total=None, count="")
 
         def show(name: str, done: int = 0, total: int = 0) -> None:

@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 
-from edqn_jax.watchers import shown_phases
+import edqn_jax
+from edqn_jax.watchers import shown_phases, taken
+from tests.support.miniature import WORLD
 
 
 class Stream(io.StringIO):
@@ -45,3 +47,34 @@ def test_who_gives_a_phase_is_told_and_nothing_is_shown(monkeypatch: pytest.Monk
     with shown_phases(hear) as told:
         assert told is hear
     assert stream.getvalue() == ""
+
+
+def test_no_second_line_is_shown_where_a_command_or_script_shows_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = Stream(terminal=True)
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setenv("TERM", "xterm")
+    with taken("my script"), shown_phases(None) as told:
+        assert told is None
+    with shown_phases(None) as told:
+        assert told is not None
+    assert stream.getvalue()
+
+
+def test_what_is_printed_meanwhile_to_a_file_stays_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    file = Stream(terminal=False)
+    monkeypatch.setattr(sys, "stderr", Stream(terminal=True))
+    monkeypatch.setattr(sys, "stdout", file)
+    monkeypatch.setenv("TERM", "xterm")
+    with shown_phases(None):
+        print("a note")
+    assert file.getvalue() == "a note\n"
+
+
+def test_an_evaluation_tells_its_phases_to_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = Stream(terminal=True)
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setenv("TERM", "xterm")
+    config = edqn_jax.make_config(str(WORLD), drone={"physics": "rigid_body"}, env={"sensor": "blind"})
+    policy = edqn_jax.FunctionPolicy(lambda observation, memory, key: ("up", memory), config)
+    edqn_jax.evaluate(policy, str(WORLD))
+    assert all(f"{name} " in stream.getvalue() for name in ("preparing worlds", "compiling", "shortest paths"))

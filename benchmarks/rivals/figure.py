@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, PercentFor
 
 from edqn_jax.config import FAMILIES
 from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, open_figure
-from rivals.rows import Row, figures
+from rivals.rows import EXACT, Row, figures
 
 OURS = "E-DQN"
 LEARNER, PLANNER = LINE, SECOND_LINE
@@ -59,10 +59,13 @@ def _name(world: str) -> str:
 def _caption(rows: Sequence[Row]) -> str:
     devices = ", ".join(dict.fromkeys(row["device"] for row in rows if row["device"]))
     quick = "; quick" if any(row["settings"].get("quick") for row in rows) else ""
+    exact = (
+        "DQN depth and DQN ranges have exact sensors: upper bounds. " if EXACT & {row["name"] for row in rows} else ""
+    )
     return (
         f"{devices}{quick}. Blue: learners, without a map. Orange: planners, with the map. "
         "Planning: computation alone; medians of flights that arrived. Bars: 95 % intervals.\n"
-        "DQN depth and DQN ranges have exact sensors: upper bounds. The paper's world is our reconstruction."
+        f"{exact}The paper's world is our reconstruction."
     )
 
 

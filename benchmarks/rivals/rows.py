@@ -19,6 +19,9 @@ from rivals.planners.planner import SAMPLING
 
 Row = dict[str, Any]
 
+EXACT = {"DQN depth", "DQN ranges"}
+"""Learners with sensors that no real drone has."""
+
 
 def join_rows(rows: Iterable[Row]) -> list[Row]:
     """Joins the rows of the same method, world, device and settings into one row with all seeds.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rivals.planners.planner import IMPROVING
-from rivals.rows import Row, Worth, figures, worth
+from rivals.rows import EXACT, Row, Worth, figures, worth
 from rivals.stack import STACK
 
 PAPER_SOURCE = "Chao, Dillmann, Roennau, Xiong, Biomimetics 2024, 9(4), 238, Table 3"
@@ -48,7 +48,6 @@ EXPLAINED = """\
 - Memory: peak memory of the method's process and its workers, with JAX and the airframe, plus that of the
   accelerator."""
 
-EXACT = {"DQN depth", "DQN ranges"}
 BOUNDS = "- DQN depth and DQN ranges have exact sensors, which no real drone has: they are upper bounds."
 
 PARAGRAPH = """\

@@ -17,6 +17,8 @@ from worth_parts import traffic
 from worth_parts.axes import AXES, BLIND, CLOCK, DEPTH, RATES_HZ
 from worth_parts.table import Cell, best_of, rows_of, verdict_of
 
+WHITE = "#ffffff"
+
 COLOURS = {
     "events": "#e69f00",
     "frames": "#56b4e9",
@@ -28,11 +30,11 @@ COLOURS = {
     "depth-late-1": "#a6d9c7",
     "depth-late-2": "#d3ece4",
     "no difference": "#d9d9d9",
-    "–": "#ffffff",
+    "–": WHITE,
 }
 """By verdict; those of the bytes are `events`, `frames` and `no difference`."""
 
-DEEP = {verdict for verdict, colour in COLOURS.items() if colour in ("#3f7fbf", "#7f6fc4", "#009e73")}
+DEEP = {"depth", *(verdict for verdict in COLOURS if verdict.startswith("frame-"))}
 """Verdicts whose colours want light letters."""
 
 LABELS = {
@@ -170,8 +172,9 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     for (row, column), (who, said) in panel.cells.items():
         x, y = panel.columns.index(column), panel.rows.index(row)
         hatch = HATCH if (row, column) in panel.partial else None
-        axes.add_patch(Rectangle((x, y), 1, 1, facecolor=COLOURS[who], edgecolor="white", linewidth=1.5, hatch=hatch))
-        ink = "white" if who in DEEP else INK
+        edge = "#d9d9d9" if COLOURS[who] == WHITE and hatch else WHITE
+        axes.add_patch(Rectangle((x, y), 1, 1, facecolor=COLOURS[who], edgecolor=edge, linewidth=1.5, hatch=hatch))
+        ink = WHITE if who in DEEP else INK
         under = {"facecolor": COLOURS[who], "edgecolor": "none", "pad": 1} if hatch else None
         axes.text(
             x + 0.5, y + 0.5, said, ha="center", va="center", fontsize=6.5, color=ink, linespacing=1.3, bbox=under

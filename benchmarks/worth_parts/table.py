@@ -8,6 +8,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+import yaml
 
 import success
 from edqn_jax.errors import ConfigError
@@ -21,6 +22,9 @@ GOAL = "1"
 
 LATE = "depth-late"
 """Begins the names of true depth that is old."""
+
+ALIKE = {"decisions": "decisions", "missions": "missions", "test_seed": "test worlds"}
+"""By key of a row, in words: what rows that are compared have alike, beside their learner."""
 
 DRAWS = 4000
 """Of the bootstrap of a cell, over seeds and missions; the missions of a draw are the same for all of its sensors."""
@@ -85,10 +89,17 @@ def rows_of(rows: Iterable[success.Row], axis: str) -> list[success.Row]:
     for row in own:
         newest[tuple(row.get(key) for key in ("world", "trained", "sensor", "width", "look"))] = row
     found = list(newest.values())
-    for key, said in (("decisions", "decisions"), ("missions", "missions"), ("test_seed", "test worlds")):
-        if len({row.get(key) for row in found}) > 1:
+    alike = {said: {row.get(key) for row in found} for key, said in ALIKE.items()}
+    alike["learners"] = {_learner(row) for row in found}
+    for said, values in alike.items():
+        if len(values) > 1:
             raise ConfigError(f"the rows of the axis {axis} have other {said} than each other; move some of them away")
     return found
+
+
+def _learner(row: success.Row) -> str | None:
+    """Returns the learner of a row of flights; those of bytes have none."""
+    return yaml.safe_load(row["options"])["agent"]["learner"] if "options" in row else None
 
 
 def cells_of(rows: Sequence[success.Row], axis: Axis) -> list[Cell]:

@@ -11,7 +11,7 @@ from jax import Array
 from jax.core import Tracer
 from jax.typing import ArrayLike
 
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import LIKE, ConfigError
 
 
 class Box(NamedTuple):
@@ -106,7 +106,7 @@ def _vector_of(name: str) -> np.ndarray:
         if word == HOVER:
             continue
         if word not in _AXES:
-            close = difflib.get_close_matches(word, [*_AXES, HOVER], n=1, cutoff=0.5)
+            close = difflib.get_close_matches(word, [*_AXES, HOVER], n=1, cutoff=LIKE)
             hint = f"; did you mean '{close[0]}'?" if close else f"; moves are made of {', '.join(_AXES)}, or {HOVER}"
             raise ConfigError(f"there is no move '{word}'{hint}")
         axis, sign = _AXES[word]

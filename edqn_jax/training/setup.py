@@ -108,7 +108,8 @@ class TrainingSetup:
         self.start = start
         display.phase("preparing worlds")
         self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)
-        pool.submit(_load_libraries)  # where they are not kept, compilers need no Python, and worlds no libraries
+        # Where they are not kept, compilers need no Python, and worlds no libraries. Who calls one finds its errors.
+        pool.submit(_load_libraries, config, len(self.devices))
         # A world's file may be missing on one host.
         self.missions = processes.run_synchronised(lambda: missions_of_runs(self.configs, reward))
         worlds = [missions.training.env_params for missions in self.missions]
@@ -228,11 +229,13 @@ def set_up_training(
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _load_libraries() -> None:
-    """Has what nearly every program calls in C or CUDA compiled, unless it is kept."""
-    drawing.is_available("cpu" if jax.default_backend() == "cpu" else "cuda")
-    products.is_available()
-    all_sum.is_available()
+def _load_libraries(config: Config, devices: int) -> None:
+    """Has what the program of a training calls in C or CUDA compiled, unless it is kept."""
+    on_cpu = jax.default_backend() == "cpu"
+    drawing.is_available("cpu" if on_cpu else "cuda")
+    products.precision_of(config.train.products)
+    if on_cpu and devices > 1 and jax.process_count() == 1:
+        all_sum.is_available()
 
 
 def _in_background(pool: Executor, work: Callable[[], Made]) -> Future[Made]:

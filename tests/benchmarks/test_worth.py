@@ -127,6 +127,17 @@ def test_controls_of_another_axis_stand_beside_sensors_that_differ_alone() -> No
     assert table.cells_of(table.rows_of(rows, "size"), axis)[0].arrived["blind"].mean() == 0.5
 
 
+def test_rows_of_two_learners_are_not_compared() -> None:
+    rows = [
+        row(sensor, 0.5, options=f"agent: {{learner: {name}}}")
+        for sensor, name in (("events", "dqn"), ("frames", "dqn"))
+    ]
+    assert len(table.rows_of(rows, "looks")) == 2
+    rows.append(row("frame-pair", 0.5, options="agent: {learner: pqn}"))
+    with pytest.raises(ConfigError, match="rows of the axis looks have other learners than each other"):
+        table.rows_of(rows, "looks")
+
+
 def test_a_camera_with_a_clock_has_its_rate_and_latency_and_counts_as_frames() -> None:
     config = config_of(AXES["age"], Place("court", "0.3 to 1 s", "frame-pair@60"), SMALL)
     assert (config.env.sensor, config.exposure.rate_hz, config.exposure.latency_s) == ("frame-pair", 60, 0.015)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 from edqn_jax.cli.process.durations import Durations
 from edqn_jax.cli.process.streams import Lasting, lasting_streams
+from edqn_jax.watchers import taken
 
 if TYPE_CHECKING:
     from edqn_jax.evaluation.rollouts import ShowPhase
@@ -203,7 +204,8 @@ def status_of(title: str, outputs: Sequence[Lasting]) -> Iterator[None]:
     _shown.append(status)
     status.start()
     try:
-        yield
+        with taken(title):
+            yield
     finally:
         end_status()
         _timed.remove(durations)

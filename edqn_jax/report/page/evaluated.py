@@ -90,11 +90,7 @@ def fly_run(
         raise ConfigError(f"a file of the run in '{folder}' is not as a run writes it: {error}"[:300]) from None
     missions, flights = _evaluate(config, params, AgentActor(config), most, f"'{folder}'", message, phase)
     count, notes = len(flights.outcome), worlds_replaced(folder)
-    if config.world.name not in FAMILIES and count > 1 and config.train.keep == "best":
-        notes.append(
-            "All flights but the first are of the run's validation, by which its policy was chosen among others; edqn "
-            "evaluate flies others."
-        )
+    notes += _chosen_by(config, count)
     if count < config.train.validation_missions:
         notes.append(f"{count} of the run's {config.train.validation_missions} evaluation flights are on this page.")
     ended = Outcome(int(flights.outcome[0])).name.lower()
@@ -104,6 +100,16 @@ def fly_run(
             "rounding is another."
         )
     return EvaluatedRun(name, config, text, params, missions, flights, summary, metrics, episodes, notes)
+
+
+def _chosen_by(config: Config, flights: int) -> list[str]:
+    """Returns a note where flights are those by which a policy was chosen: of one trained in a world from a file."""
+    if config.world.name in FAMILIES or flights < 2 or config.train.keep != "best":
+        return []
+    return [
+        "All flights but the first are of the training's validation, by which the policy was chosen among others; edqn "
+        "evaluate flies others."
+    ]
 
 
 def fly_policy(
@@ -126,7 +132,8 @@ def fly_policy(
     """
     config = config_of(policy)
     missions, flights = _evaluate(config, policy.params, actor_of(policy, config), most, f"'{name}'", message, phase)
-    return EvaluatedRun(name, config, config_text(config), policy.params, missions, flights, {}, [], {}, [])
+    notes = _chosen_by(config, len(flights.outcome)) if isinstance(policy, Policy) else []
+    return EvaluatedRun(name, config, config_text(config), policy.params, missions, flights, {}, [], {}, notes)
 
 
 def _evaluate(

@@ -233,7 +233,7 @@ _NUMPY: dict[str, Callable[..., Numbers]] = {
 def _iota(params: dict[str, Any]) -> Numbers:
     along = [1] * len(params["shape"])
     along[params["dimension"]] = -1
-    counted = np.arange(params["shape"][params["dimension"]], dtype=params["dtype"])
+    counted = np.arange(params["shape"][params["dimension"]]).astype(params["dtype"])
     return np.broadcast_to(counted.reshape(along), params["shape"])
 
 
@@ -248,7 +248,8 @@ _OF_WHOLE_NUMBERS: dict[str, Callable[..., Numbers]] = {
     "cumsum": _cumsum,
     "reduce_sum": lambda params, x: x.sum(tuple(params["axes"]), dtype=x.dtype),
 }
-"""Likewise, of whole numbers and truths alone, of which no result is rounded; of others XLA's is taken."""
+"""Likewise, of whole numbers and truths alone, for which both agree: sums are exact, and rounding to the nearest float
+has one result. Of others XLA's is taken."""
 
 _ELEMENTWISE = frozenset(
     "abs add add_any and atan2 clamp convert_element_type cos div eq exp floor ge gt integer_pow is_finite le log lt "

@@ -1,0 +1,66 @@
+"""Prints who learns the axis `age` of `benchmarks/worth.py` best, from rows that it wrote, as Markdown.
+
+    python scripts/learners.py docs/results/worth_learners docs/results/worth
+
+The first folder has a folder of rows for each learner (`dqn`, `pqn`, `imitation`, `teacher`); the second the rows of
+the map itself, whose events by DQN are a second training of the same seeds, pooled with those of `dqn`, and whose blind
+agent stands beside them. Cells of two times to impact are pooled. Intervals are a bootstrap over seeds and missions.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+import numpy as np
+
+import success
+from worth_parts import own, table
+from worth_parts.axes import AXES, SPEEDS_M_S
+
+TIMES = {"0.3 to 0.5 s": ("0.3 to 0.4 s", "0.4 to 0.5 s"), "0.5 to 1 s": ("0.5 to 0.7 s", "0.7 to 1 s")}
+COLUMNS = {"blind": "blind", "pqn": "PQN", "dqn": "DQN, two trainings", "imitation": "imitation", "teacher": "teacher"}
+
+
+def arrived(rows: list[success.Row], cells: list[str]) -> np.ndarray:
+    """Returns [S, M] which missions of these cells arrived, the seeds of several rows one below the other."""
+    seeds = [np.concatenate([_digits(row["flown"][cell]) for cell in cells], axis=1) for row in rows]
+    return np.concatenate(seeds) == int(table.GOAL)
+
+
+def _digits(seeds: list[str]) -> np.ndarray:
+    return np.array([list(map(int, seed)) for seed in seeds])
+
+
+def main(learners: Path, others: Path) -> None:
+    """Prints the table of the rows in two folders."""
+    own.register()
+    rows = {name: success.read_rows(learners / name) for name in COLUMNS if name != "blind"}
+    of_map = {row["sensor"]: row for row in table.rows_of(success.read_rows(others), "age")}
+    rows |= {"blind": [of_map["blind"]], "dqn": [*rows["dqn"], of_map["events"]]}
+    print(f"| m/s | time to impact | {' | '.join(COLUMNS.values())} | imitation ahead of DQN by | PQN behind DQN by |")
+    print("| --- " * (len(COLUMNS) + 4) + "|")
+    for speed in SPEEDS_M_S:
+        for title, times in TIMES.items():
+            cells = [cell for cell in AXES["age"].flown if cell.startswith(times) and cell.endswith(f" {speed:g} m/s")]
+            cell = table.Cell("court", "", title, {name: arrived(rows[name], cells) for name in COLUMNS})
+            shown = [f"{100 * cell.arrived[name].mean():.1f} ({_text(cell.interval(name), '–')})" for name in COLUMNS]
+            leads = [_lead(cell, "imitation", "dqn"), _lead(cell, "dqn", "pqn")]
+            print(f"| {speed:g} | {title} | {' | '.join([*shown, *leads])} |")
+
+
+def _lead(cell: table.Cell, first: str, second: str) -> str:
+    ahead = 100 * (cell.arrived[first].mean() - cell.arrived[second].mean())
+    return f"{ahead:.1f} ({_text(cell.lead(first, second), ' to ')})"
+
+
+def _text(interval: tuple[float, float], to: str) -> str:
+    return to.join(f"{100 * end:.1f}" for end in interval)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
+    main(*map(Path, sys.argv[1:]))
