@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import runpy
 from pathlib import Path
 
 import jax
@@ -125,6 +126,29 @@ def test_controls_of_another_axis_stand_beside_sensors_that_differ_alone() -> No
     assert [set(cell.arrived) for cell in cells] == [{"blind", "events"}] * len(axis.flown)
     rows.append(row("blind", 0.5, dict.fromkeys(first, 0.5), **at | {"axis": "size"}))  # its own, where it has some
     assert table.cells_of(table.rows_of(rows, "size"), axis)[0].arrived["blind"].mean() == 0.5
+
+
+def test_learners_stand_in_one_table_with_both_trainings_of_dqn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rates = {"pqn": 0.25, "dqn": 0.5, "imitation": 1.0, "teacher": 1.0}
+    flown = dict.fromkeys(AXES["age"].flown, 0.0)
+    at = {"axis": "age", "world": "court", "trained": "0.3 to 1 s"}
+    rows = {
+        f"learners/{name}/a-b-{name}.json": row("events", rate, dict.fromkeys(flown, rate), **at)
+        for name, rate in rates.items()
+    }
+    of_map = {"events": 0.7, "blind": 0.1}
+    rows |= {f"map/a-b-{name}.json": row(name, rate, dict.fromkeys(flown, rate), **at) for name, rate in of_map.items()}
+    for name, one in rows.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(json.dumps(one))
+    script = runpy.run_path(str(Path(__file__).parents[2] / "scripts" / "learners.py"))
+    script["main"](tmp_path / "learners", tmp_path / "map")
+    head, _, *lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 6 and "DQN, two trainings" in head
+    cells = [cell.strip().partition(" (")[0] for cell in lines[0].strip("|").split("|")]
+    assert cells == ["6", "0.3 to 0.5 s", "10.0", "25.0", "60.0", "100.0", "100.0", "40.0", "35.0"]
 
 
 def test_rows_of_two_learners_are_not_compared() -> None:

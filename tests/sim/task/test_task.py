@@ -28,7 +28,7 @@ GROUPS: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("groups", GROUPS.values(), ids=GROUPS)
 def test_what_is_traced_for_shapes_has_those_of_the_task(
-    monkeypatch: pytest.MonkeyPatch, groups: dict[str, dict[str, Any]]
+    monkeypatch: pytest.MonkeyPatch, groups: dict[str, Any]
 ) -> None:
     config: Config = make_config(str(WORLD), **groups)
     assert config.drone.physics == "mjx"
