@@ -33,7 +33,7 @@ MEAN_FRAMES = (
     *("--exposure.sensitivity-e-lux-s", str(MEAN_OF * ExposureConfig.sensitivity_e_lux_s)),
     *("--exposure.read-noise-e", str(MEAN_OF**0.5 * ExposureConfig.read_noise_e)),
 )
-MEAN = {BLIND: (), DEPTH: (), "events": MEAN_EVENTS, "frames": MEAN_FRAMES, "frame-pair": MEAN_FRAMES}
+MEAN = {"events": MEAN_EVENTS, "frames": MEAN_FRAMES, "frame-pair": MEAN_FRAMES}
 """Real sensors of one size, whose noise averages out alike: the events' thresholds are a real camera's 0.2."""
 
 LUX = (0.1, 1.0, 10.0, 100.0, 10_000.0)
@@ -81,7 +81,7 @@ class Axis:
     same_flown: bool = False
     """Likewise of the conditions that are flown."""
     controls: str | None = None
-    """Another axis, of the same task, whose rows of the controls are this one's as well."""
+    """Another axis, of the same task, whose rows of the controls are this one's, which has none."""
 
 
 @dataclasses.dataclass(frozen=True)

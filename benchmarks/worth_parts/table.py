@@ -84,8 +84,8 @@ def rows_of(rows: Iterable[success.Row], axis: str) -> list[success.Row]:
     newest, controls = {}, AXES[axis].controls if axis in AXES else None
     known = [row for row in rows if row.get("benchmark") == "worth"]
     own = [row for row in known if row["axis"] == axis]
-    if own and controls:
-        own = [row for row in known if row["axis"] == controls and row["sensor"] in (BLIND, DEPTH)] + own
+    if own:
+        own += [row for row in known if row["axis"] == controls and row["sensor"] in (BLIND, DEPTH)]
     for row in own:
         newest[tuple(row.get(key) for key in ("world", "trained", "sensor", "width", "look"))] = row
     found = list(newest.values())
@@ -108,7 +108,7 @@ def cells_of(rows: Sequence[success.Row], axis: Axis) -> list[Cell]:
     first, cells = next(iter(axis.trained)), []
     for world, trained, flown in itertools.product(axis.worlds, axis.trained, axis.flown):
         arrived = {}
-        for sensor in axis.sensors:
+        for sensor in dict.fromkeys([BLIND, DEPTH, *axis.sensors]):
             row = of.get((world, first if is_first_alone(axis, sensor) else trained, sensor))
             if row is None:
                 continue

@@ -197,3 +197,18 @@ def test_it_logs_nothing_and_asks_for_nothing(opened: Opened, page_file: Path) -
 def test_the_name_of_a_folder_is_text(opened: Opened) -> None:
     assert HOSTILE in opened.page.inner_text("table >> nth=0") and opened.page.locator("img").count() == 0
     assert "broken" not in opened.page.title()
+
+
+def test_flights_of_one_run_have_a_colour_for_each_ending_and_its_name_beside(
+    browser: Any, page_file: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "one.html"
+    assert main(["report", str(page_file.parent / "ahead"), "--out", str(file)]) == 0
+    there = Opened(browser, file, DESK)
+    options = there.page.evaluate("[...document.querySelectorAll('#flight option')].map((each) => each.textContent)")
+    others = {option.partition(": ")[2].partition(",")[0] for option in options[1:]}
+    named = there.page.evaluate("[...document.querySelectorAll('#colours span')].map((each) => each.textContent)")
+    assert others and {name.strip(" ●") for name in named} == others
+    there.page.locator("#others").uncheck()
+    assert there.page.evaluate("document.getElementById('colours').textContent") == ""
+    there.page.close()

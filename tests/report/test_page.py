@@ -19,10 +19,11 @@ from PIL import Image
 
 from edqn_jax.cli import main
 from edqn_jax.config import Config
+from edqn_jax.config.loading import make_config
 from edqn_jax.devices import devices
 from edqn_jax.report.page import document
 from edqn_jax.report.page.contents import COLUMNS, _by_interest, flight_data, learning_curves, script_text
-from edqn_jax.report.page.evaluated import EvaluatedRun, folders_of, names_of
+from edqn_jax.report.page.evaluated import EvaluatedRun, _chosen_by, folders_of, names_of
 from edqn_jax.report.page.pictures import LEVELS, picture_strip
 from edqn_jax.report.page.worlds import world_data
 from edqn_jax.sim.scene.mjcf import load_scene
@@ -112,6 +113,20 @@ def test_the_view_uses_of_three_what_is_in_its_bundle() -> None:
     used = set(re.findall(r"THREE\.(\w+)", (page / "page.js").read_text(encoding="utf-8")))
     bundled = set(re.findall(r"\w+", (page / "vendored" / "three.entry.mjs").read_text(encoding="utf-8")))
     assert used and used <= bundled
+
+
+@pytest.mark.parametrize(
+    ("world", "keep", "flights", "said"),
+    [
+        ("paper", "best", 8, True),
+        ("paper", "last", 8, False),
+        ("paper", "best", 1, False),
+        ("medium", "best", 8, False),
+    ],
+)
+def test_a_page_says_where_its_flights_chose_the_policy(world: str, keep: Any, flights: int, said: bool) -> None:
+    config = make_config(world, train={"keep": keep})
+    assert bool(_chosen_by(config, flights)) == said
 
 
 def test_a_flight_keeps_its_first_and_last_row_and_its_speed() -> None:
