@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from typing import Any
 
 from rivals.planners.planner import IMPROVING
@@ -65,10 +65,15 @@ def text(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> str:
     for world in dict.fromkeys(row["world"] for row in rows):
         own = [row for row in rows if row["world"] == world]
         parts.append(f"## {world}\n\n{methods(own)}")
-    parts += ["\n".join([EXPLAINED, *([BOUNDS] if {row["name"] for row in rows} & EXACT else [])]), paper()]
+    parts += [explain({row["name"] for row in rows}), paper()]
     parts += [worth_table(one) for one in worth(rows)]
     parts += [rates_table(one) for one in rates]
     return "\n\n".join(parts)
+
+
+def explain(names: Set[str]) -> str:
+    """Returns what the columns mean, and of methods of these names what else must be known."""
+    return "\n".join([EXPLAINED, *([BOUNDS] if names & EXACT else [])])
 
 
 def methods(rows: Sequence[Row]) -> str:

@@ -137,6 +137,11 @@ def test_methods_take_turns_seed_by_seed_and_all_of_it_is_told(
     assert "3 of 3: 100%" in capsys.readouterr().out
 
 
+def test_only_methods_that_are_there_are_explained() -> None:
+    assert "upper bounds" in table.explain({"E-DQN", "DQN depth"})
+    assert "upper bounds" not in table.explain({"E-DQN"}) and "Trains:" in table.explain({"E-DQN"})
+
+
 def test_a_closed_pipe_costs_no_file_and_a_full_disk_no_table(
     faked: type[Fake], clear: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,6 +22,7 @@ from edqn_jax.cli.arguments import MEANINGS, flags_of
 from edqn_jax.cli.evaluate import EvaluateArgs, parse_evaluate
 from edqn_jax.cli.fly import darkening_of, parse_fly, simulate
 from edqn_jax.cli.help import COMMON, NAMED, flag_of
+from edqn_jax.cli.record import parse_record
 from edqn_jax.cli.train import parse_train, train_flags
 from edqn_jax.config import Config, get_preset
 from edqn_jax.config.limits import limits_of
@@ -209,6 +210,11 @@ def test_bad_input_ends_with_2_a_sentence_and_nothing_made(argv, says, capsys, t
     assert said.err.startswith("edqn: ") and says in said.err and said.err.count("\n") == 1 and not said.out
     assert list(tmp_path.iterdir()) == []
     assert trainer.calls == []
+
+
+def test_a_recording_that_cannot_be_written_is_refused_before_a_policy_is_loaded(tmp_path):
+    with pytest.raises(ConfigError, match=r"flight.gif' cannot be written: there is no folder"):
+        parse_record(["pretrained", str(tmp_path / "nowhere" / "flight.gif")])
 
 
 def test_our_own_complaints_are_one_line(capsys):

@@ -39,9 +39,10 @@ def test_what_is_traced_for_shapes_has_those_of_the_task(
         raise AssertionError("MJX is slow to trace")
 
     state = jax.eval_shape(lambda: own.begin(world, key, jnp.int32(0)))
-    found = [jax.eval_shape(own.step, world, state, jnp.asarray(own.still))]
-    monkeypatch.setattr(flight, "_mjx_step", refused)
-    found.append(jax.eval_shape(quick.step, world, state, jnp.asarray(own.still)))
+    with monkeypatch.context() as patched:  # before the other, whose trace JAX would find again
+        patched.setattr(flight, "_mjx_step", refused)
+        shaped = jax.eval_shape(quick.step, world, state, jnp.asarray(own.still))
+    found = [jax.eval_shape(own.step, world, state, jnp.asarray(own.still)), shaped]
     assert jax.tree.structure(found[0]) == jax.tree.structure(found[1])
     one, other = ([(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(each)] for each in found)
     assert one == other
