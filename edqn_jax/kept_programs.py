@@ -121,7 +121,7 @@ class Place:
             name = f"{name_of(*(text.encode() for text in texts))}.executable"
             program = _load(self.file.parent / name, *trees, numbers)
             if program is None:
-                program = _compile_and_keep(self.file.parent / name, each, options)
+                program = self._compile_and_keep(self.file.parent / name, each, options)
             compiled.append(program)
             found.append((name, *trees, numbers))
         if not all((self.file.parent / name).is_file() for name, *_ in found):
@@ -130,12 +130,27 @@ class Place:
             write_kept(self.file, pickle.dumps((build.used_libraries(), found)))
         return compiled
 
+    def _compile_and_keep(
+        self, file: Path, traced: jax.stages.Lowered, options: dict[str, str | bool] | None
+    ) -> jax.stages.Compiled:
+        hits = _hits_of_thread()
+        compiled = traced.compile(options)
+        was_kept_by_jax = _hits_of_thread() > hits  # see `named`
+        if not was_kept_by_jax:
+            with contextlib.suppress(Exception):  # such as of a program that calls Python
+                write_kept(file, serialize_executable.serialize(compiled)[0])
+        # Left to JAX, a program would be traced in every run once its file here is not found: after an update, say.
+        if was_kept_by_jax or file.is_file():
+            for copy in file.parent.glob(f"jit_{self.name}-*"):
+                copy.unlink(missing_ok=True)
+        return compiled
+
 
 def named(function: Callable[Given, Returned], name: str | None) -> Callable[Given, Returned]:
     """Returns a function with the name of its place, if its programs are kept.
 
     JAX's cache tells programs apart by it; and one that XLA has loaded from there it writes without its functions,
-    so that it could be run and not kept.
+    so that it could be run and not kept. So nothing stays in JAX's cache under these names.
     """
     if name is None:
         return function
@@ -156,17 +171,6 @@ def _load(file: Path, in_tree: Any, out_tree: Any, numbers: Sequence[int]) -> ja
         return serialize_executable.deserialize_and_load(content, in_tree, out_tree, execution_devices=on)
     except Exception:  # as in `Place.load`
         return None
-
-
-def _compile_and_keep(
-    file: Path, traced: jax.stages.Lowered, options: dict[str, str | bool] | None
-) -> jax.stages.Compiled:
-    hits = _hits_of_thread()
-    compiled = traced.compile(options)
-    if _hits_of_thread() == hits:  # see `named`
-        with contextlib.suppress(Exception):  # such as of a program that calls Python
-            write_kept(file, serialize_executable.serialize(compiled)[0])
-    return compiled
 
 
 _of_thread = threading.local()

@@ -30,7 +30,7 @@ from edqn_jax.devices.cache import enable_compilation_cache
 from edqn_jax.devices.devices import use_cpu_devices
 use_cpu_devices(2)
 enable_compilation_cache()
-from edqn_jax.kept_programs import place_of
+from edqn_jax.kept_programs import named, place_of
 from edqn_jax.native import products
 
 def program(x, keys):
@@ -42,17 +42,23 @@ arguments = jnp.arange(32.0), jax.random.split(jax.random.key(0), 2)
 place = place_of("squares", sys.argv[1], arguments)
 [compiled] = place.load() or [None]
 if compiled is None:
-    [compiled] = place.compile([jax.jit(program).lower(*arguments)], jax.devices()[:1])
+    traced = jax.jit(named(program, place.name)).lower(*arguments)
+    if sys.argv[2:] == ["by JAX alone"]:
+        compiled = traced.compile()
+    else:
+        [compiled] = place.compile([traced], jax.devices()[:1])
 squares, keys = compiled(*arguments)
 print(float(squares.sum()), jax.random.key_data(keys).tolist())
 """
 
 
-def lines_of(folder: Path, made_of: str = "one", **variables: str) -> list[str]:
-    """Returns what a process prints that compiles a program, or loads it."""
+def lines_of(folder: Path, *arguments: str, **variables: str) -> list[str]:
+    """Returns what a process prints that compiles a program, or loads it; arguments are those of `COMMAND`."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "XDG_"))}
     environment = kept | {"XDG_CACHE_HOME": str(folder)} | variables
-    done = subprocess.run([sys.executable, "-c", COMMAND, made_of], env=environment, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", COMMAND, *(arguments or ("one",))], env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 
@@ -61,25 +67,29 @@ def lines_of(folder: Path, made_of: str = "one", **variables: str) -> list[str]:
 def test_a_program_is_traced_once_and_damaged_ones_again(tmp_path: Path) -> None:
     [traced, result] = lines_of(tmp_path)
     assert traced == "traced" and lines_of(tmp_path) == [result]
+    [program], [place] = tmp_path.rglob("*.executable"), tmp_path.rglob("*.program")
     for _ in range(2):  # the same program, from elsewhere
         assert lines_of(tmp_path, "another")[-1] == result
-    [program], places = tmp_path.rglob("*.executable"), sorted(tmp_path.rglob("*.program"))
-    assert len(places) == 2 and lines_of(tmp_path, "another") == [result]
-    for file in (program, *places):
+    assert len([*tmp_path.rglob("*.program")]) == 2 and [*tmp_path.rglob("*.executable")] == [program]
+    for file in (program, place):
         file.write_bytes(file.read_bytes()[:-20])
-        assert lines_of(tmp_path) == ["traced", result]
+        assert lines_of(tmp_path) == ["traced", result] and lines_of(tmp_path) == [result]
     assert lines_of(tmp_path, EDQN_JAX_NATIVE="0")[0] == "traced"
 
 
 @pytest.mark.whole
-def test_what_jax_has_kept_is_not_kept_again_and_runs(tmp_path: Path) -> None:
+def test_what_jax_has_kept_runs_and_is_kept_here_from_the_next_time_on(tmp_path: Path) -> None:
     """XLA writes a program that it has loaded itself without its functions, so that it could not be run."""
-    [_, result] = lines_of(tmp_path)
-    for file in [*tmp_path.rglob("*.executable"), *tmp_path.rglob("*.program")]:
-        file.unlink()
-    for _ in range(2):
-        assert lines_of(tmp_path)[-1] == result
-    assert not list(tmp_path.rglob("*.executable")) + list(tmp_path.rglob("*.program"))
+
+    def of_jax() -> list[Path]:
+        return list(tmp_path.rglob("jit_kept_squares-*"))
+
+    [_, result] = lines_of(tmp_path, "one", "by JAX alone")
+    assert len(of_jax()) == 1
+    assert lines_of(tmp_path) == ["traced", result]
+    assert not of_jax() and not list(tmp_path.rglob("*.executable"))
+    assert lines_of(tmp_path) == ["traced", result] and lines_of(tmp_path) == [result]
+    assert not of_jax()
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from edqn_jax.devices.hardware import count_cores
 from edqn_jax.files import cache_folder
 
 MAX_BYTES = 2**30
-"""Of kept programs; beyond this the older ones are deleted."""
+"""Of kept programs; beyond this those used longest ago are deleted."""
 
 
 _enabled: list[Path] = []  # the folder, once this process keeps programs in it
@@ -83,17 +83,18 @@ def _cpu_fingerprint() -> str:
 
 
 def _make_room(folder: Path, most: int) -> None:
-    """Deletes the oldest files, down to half of `most` bytes, if a folder holds more than `most`."""
+    """Deletes the files used longest ago, down to half of `most` bytes, if a folder holds more than `most`."""
     files = []
-    for file in folder.rglob("*"):
-        with contextlib.suppress(FileNotFoundError):  # another command makes room as well
-            if file.is_file():
-                files.append((file, file.stat()))
+    for place, _, names in os.walk(folder):
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):  # another command makes room as well
+                files.append((os.path.join(place, name), os.stat(os.path.join(place, name))))
     left = sum(status.st_size for _, status in files)
     if left <= most:
         return
-    for file, status in sorted(files, key=lambda each: each[1].st_mtime):
+    # Where no times of reading are written, these are of writing.
+    for file, status in sorted(files, key=lambda each: max(each[1].st_atime, each[1].st_mtime)):
         if left <= most // 2:
             break
-        file.unlink(missing_ok=True)
+        Path(file).unlink(missing_ok=True)
         left -= status.st_size

@@ -65,12 +65,15 @@ def test_nothing_is_kept_where_it_may_not_be(variables: dict[str, str], folder: 
     assert not (tmp_path / "cache").exists()
 
 
-def test_the_oldest_programs_go_once_there_are_too_many_bytes(tmp_path: Path) -> None:
-    for age in range(6):
-        file = tmp_path / f"{age}"
+def test_the_programs_used_longest_ago_go_once_there_are_too_many_bytes(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    read, written = (5, 0, 3, 2, 0, 1), (4, 0, 1, 2, 3, 1)  # days ago
+    for number, ages in enumerate(zip(read, written, strict=True)):
+        file = tmp_path / "folder" / f"{number}"
         file.write_bytes(bytes(100))
-        os.utime(file, (1_000_000 - age, 1_000_000 - age))
+        last_read, last_written = (1_000_000 - 86_400 * age for age in ages)
+        os.utime(file, (last_read, last_written))
     cache._make_room(tmp_path, 600)
-    assert len(list(tmp_path.iterdir())) == 6
+    assert len(list((tmp_path / "folder").iterdir())) == 6
     cache._make_room(tmp_path, 599)
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["0", "1"]
+    assert sorted(file.name for file in (tmp_path / "folder").iterdir()) == ["1", "4"]
