@@ -2,9 +2,11 @@
 
     python scripts/learners.py docs/results/worth_learners docs/results/worth
 
-The first folder has a folder of rows for each learner (`dqn`, `pqn`, `imitation`, `teacher`); the second the rows of
-the map itself, whose events by DQN are a second training of the same seeds, pooled with those of `dqn`, and whose blind
-agent stands beside them. Cells of two times to impact are pooled. Intervals are a bootstrap over seeds and missions.
+The first folder has a folder of rows for each learner (`dqn`, `pqn`, `imitation`, `teacher`), all of events; the second
+the rows of the map itself, whose events by DQN are a second training of the same seeds, pooled with those of `dqn`, and
+whose blind agent stands beside them. In the second table are sensors that were taught by one policy (folders `taught`,
+`taught_teacher`), beside the rows of the map, where they learn by DQN. Cells of two times to impact are pooled.
+Intervals are a bootstrap over seeds and missions.
 """
 
 from __future__ import annotations
@@ -24,6 +26,9 @@ TIMES = {"0.3 to 0.5 s": ("0.3 to 0.4 s", "0.4 to 0.5 s"), "0.5 to 1 s": ("0.5 t
 COLUMNS = {"blind": "blind", "pqn": "PQN", "dqn": "DQN, two trainings", "imitation": "imitation", "teacher": "teacher"}
 
 
+TAUGHT = {"frames": "one frame", "frame-pair": "pair", "frame-pair@120": "pair, 120 a second"}
+
+
 def arrived(rows: list[success.Row], cells: list[str]) -> np.ndarray:
     """Returns [S, M] which missions of these cells arrived, the seeds of several rows one below the other."""
     seeds = [np.concatenate([_digits(row["flown"][cell]) for cell in cells], axis=1) for row in rows]
@@ -35,25 +40,40 @@ def _digits(seeds: list[str]) -> np.ndarray:
 
 
 def main(learners: Path, others: Path) -> None:
-    """Prints the table of the rows in two folders."""
+    """Prints both tables of the rows in two folders."""
     own.register()
+    of_map = {row["sensor"]: [row] for row in table.rows_of(success.read_rows(others), "age")}
     rows = {name: success.read_rows(learners / name) for name in COLUMNS if name != "blind"}
-    of_map = {row["sensor"]: row for row in table.rows_of(success.read_rows(others), "age")}
-    rows |= {"blind": [of_map["blind"]], "dqn": [*rows["dqn"], of_map["events"]]}
-    print(f"| m/s | time to impact | {' | '.join(COLUMNS.values())} | imitation ahead of DQN by | PQN behind DQN by |")
-    print("| --- " * (len(COLUMNS) + 4) + "|")
+    rows |= {"blind": of_map["blind"], "dqn": rows["dqn"] + of_map["events"]}
+    _print_table(
+        rows, COLUMNS, {"imitation ahead of DQN by": ("imitation", "dqn"), "PQN behind DQN by": ("dqn", "pqn")}
+    )
+    print()
+    taught = {row["sensor"]: [row] for row in success.read_rows(learners / "taught")}
+    rows = {"teacher": success.read_rows(learners / "taught_teacher"), **taught}
+    rows |= {f"{name} by DQN": of_map[name] for name in taught}
+    leads = {f"{title} ahead of DQN by": (name, f"{name} by DQN") for name, title in TAUGHT.items()}
+    _print_table(rows, {"teacher": "teacher"} | TAUGHT, leads)
+
+
+def _print_table(
+    rows: dict[str, list[success.Row]], columns: dict[str, str], leads: dict[str, tuple[str, str]]
+) -> None:
+    print(f"| m/s | time to impact | {' | '.join([*columns.values(), *leads])} |")
+    print("| --- " * (len(columns) + len(leads) + 2) + "|")
     for speed in SPEEDS_M_S:
         for title, times in TIMES.items():
             cells = [cell for cell in AXES["age"].flown if cell.startswith(times) and cell.endswith(f" {speed:g} m/s")]
-            cell = table.Cell("court", "", title, {name: arrived(rows[name], cells) for name in COLUMNS})
-            shown = [f"{100 * cell.arrived[name].mean():.1f} ({_text(cell.interval(name), '–')})" for name in COLUMNS]
-            leads = [_lead(cell, "imitation", "dqn"), _lead(cell, "dqn", "pqn")]
-            print(f"| {speed:g} | {title} | {' | '.join([*shown, *leads])} |")
+            cell = table.Cell("court", "", title, {name: arrived(rows[name], cells) for name in rows})
+            shown = [f"{100 * cell.arrived[name].mean():.1f} ({_text(cell.interval(name), '–')})" for name in columns]
+            shown += [_lead(cell, *pair) for pair in leads.values()]
+            print(f"| {speed:g} | {title} | {' | '.join(shown)} |")
 
 
 def _lead(cell: table.Cell, first: str, second: str) -> str:
-    ahead = 100 * (cell.arrived[first].mean() - cell.arrived[second].mean())
-    return f"{ahead:.1f} ({_text(cell.lead(first, second), ' to ')})"
+    ahead, (low, high) = 100 * (cell.arrived[first].mean() - cell.arrived[second].mean()), cell.lead(first, second)
+    bold = "**" if low > 0 or high < 0 else ""
+    return f"{bold}{ahead:.1f}{bold} ({_text((low, high), ' to ')})"
 
 
 def _text(interval: tuple[float, float], to: str) -> str:
