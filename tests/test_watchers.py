@@ -78,3 +78,14 @@ def test_an_evaluation_tells_its_phases_to_a_terminal(monkeypatch: pytest.Monkey
     policy = edqn_jax.FunctionPolicy(lambda observation, memory, key: ("up", memory), config)
     edqn_jax.evaluate(policy, str(WORLD))
     assert all(f"{name} " in stream.getvalue() for name in ("preparing worlds", "compiling", "shortest paths"))
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_an_environment_tells_a_terminal_alone_that_worlds_are_prepared(
+    monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
+    stream = Stream(terminal=terminal)
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setenv("TERM", "xterm")
+    edqn_jax.make(str(WORLD), edqn_jax.make_config(str(WORLD), drone={"physics": "rigid_body"}))
+    assert ("preparing worlds" in stream.getvalue()) == bool(stream.getvalue()) == terminal

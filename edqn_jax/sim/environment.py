@@ -43,6 +43,7 @@ from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.reward import Reward, check_reward
 from edqn_jax.sim.task.task import task_of
 from edqn_jax.sim.worlds.families import SPLITS, Split, world_of_file, worlds_of
+from edqn_jax.watchers import shown_phases
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -215,7 +216,10 @@ def make(
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
     group.check_alone(config, "edqn_jax.make")
-    pool = _random_pool(config, name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
+    with shown_phases(None) as told:  # the first time, programs are compiled for some seconds
+        if told is not None:
+            told("preparing worlds")
+        pool = _random_pool(config, name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
     return Environment(config, EnvParams(load_airframe(config.drone), pool, own_missions(pool), reward))
 
 
