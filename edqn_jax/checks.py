@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jax import Array
+from jax import Array, lax
 from jax.experimental import checkify
 
 
@@ -31,8 +31,11 @@ def check_index(index: Array, below: int | Array, of: str) -> None:
 
 def is_finite(tree: object) -> Array:
     """Returns whether every number of a tree's arrays is finite, [] bool; whole numbers are."""
-    sums = [jnp.sum(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    return jnp.isfinite(sum(sums, jnp.zeros(())))
+    numbers = [jnp.ravel(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    if not numbers:
+        return jnp.bool_(True)
+    # One sum, and not a compiled operation for each array, into which XLA would take this apart.
+    return jnp.isfinite(jnp.sum(lax.optimization_barrier(jnp.concatenate(numbers)) if len(numbers) > 1 else numbers[0]))
 
 
 def tree_form(tree: object) -> str:

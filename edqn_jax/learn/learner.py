@@ -97,15 +97,21 @@ class UpdateStats:
         return cls({name: jnp.float32(jnp.nan) for name in names}, jnp.int32(0), jnp.int32(0))
 
     @classmethod
-    def from_updates(cls, loss: Array, metrics: Metrics, gradient_is_finite: Array) -> UpdateStats:
-        """Returns the statistics of updates [U]; metrics [U] are averaged over those with a finite loss."""
-        finite = jnp.isfinite(loss)
+    def from_updates(
+        cls, loss: Array, metrics: Metrics, gradient_is_finite: Array, made: Array | int | None = None
+    ) -> UpdateStats:
+        """Returns the statistics of updates [U], or of the first `made` [] of them.
+
+        Metrics [U] are averaged over those with a finite loss.
+        """
+        is_made = jnp.arange(len(loss)) < (len(loss) if made is None else made)
+        finite = jnp.isfinite(loss) & is_made
         count = jnp.sum(finite)
         means = {name: jnp.sum(jnp.where(finite, x, 0.0)) / jnp.maximum(count, 1) for name, x in metrics.items()}
         return cls(
             {name: jnp.where(count > 0, mean, jnp.nan) for name, mean in means.items()},
-            jnp.sum(~finite, dtype=jnp.int32),
-            jnp.sum(~gradient_is_finite, dtype=jnp.int32),
+            jnp.sum(is_made & ~finite, dtype=jnp.int32),
+            jnp.sum(is_made & ~gradient_is_finite, dtype=jnp.int32),
         )
 
 

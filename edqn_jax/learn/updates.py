@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 from jax import Array, lax
+from jax.flatten_util import ravel_pytree
 
 from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
@@ -49,7 +50,7 @@ def init_networks(config: Config, key: Array) -> Networks:
     vae, learner = embedding.init_params(config, vae_key), learner_of(config)
     return Networks(
         vae=vae,
-        vae_optimiser=_vae_optimiser(config.encoder.learning_rate).init(vae) if vae else None,
+        vae_optimiser=_vae_optimiser(config.encoder.learning_rate).init(ravel_pytree(vae)[0]) if vae else None,
         encoder=embedding.inference_params(config, vae),
         agent=learner.init(config, agent_key),
         teacher=None if learner.teacher is None else jax.tree.map(jnp.asarray, learner.teacher(config).params),
@@ -103,8 +104,8 @@ def check_begins(config: Config, policy: Policy) -> None:
 
 
 def _vae_optimiser(rate: Array | float) -> optax.GradientTransformation:
-    """Returns Adam of a step size []."""
-    return skip_nonfinite(optax.flatten(optax.adam(rate)))
+    """Returns Adam of a step size [], for parameters as one vector."""
+    return skip_nonfinite(optax.adam(rate))
 
 
 def update_vae(
@@ -127,40 +128,46 @@ def update_vae(
     part = keys.shape[0] / config.train.shards  # of all shards, on this device
     mirror = sensor_of(config).mirror
 
-    def loss(params: Params, batch: Samples, noise: Array):
+    # As one vector: what is done to each number of it is one operation, and not one for each layer.
+    vector, tree = ravel_pytree(networks.vae)
+
+    def loss(params: Array, batch: Samples, noise: Array):
         sensed = samples.to_encoder_input(batch)
         with in_precision(config.train.products):
-            total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise)
+            total, parts = vae.vae_loss(config.encoder, tree(params), sensed, batch.motion, batch.wanted, noise)
         return total * part, parts
 
-    def update(networks: Networks, keys: Array):
+    def update(state: tuple[Array, Any], keys: Array):
+        params, optimiser = state
         draw_keys, noise_keys = split_each(keys, 2)
         sample = lambda ring, key: samples.sample_batch(config.encoder, ring, kept, share, key, task, mirror)  # noqa: E731
         batch = jax.vmap(sample)(rings, draw_keys)
         # Each shard draws its own noise, so that the layout on devices does not change it.
         noise = jax.vmap(lambda key: jax.random.normal(key, (share, config.encoder.code_size)))(noise_keys)
         batch, noise = jax.tree.map(merge_shards, (batch, noise))
-        gradient, parts = jax.grad(loss, has_aux=True)(networks.vae, batch, noise)
+        gradient, parts = jax.grad(loss, has_aux=True)(params, batch, noise)
         found = gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)
         gradient, parts = all_sum(found, axis, after=0.0)
-        change, optimiser = _vae_optimiser(rate).update(gradient, networks.vae_optimiser, networks.vae)
-        networks = dataclasses.replace(networks, vae=optax.apply_updates(networks.vae, change), vae_optimiser=optimiser)
-        return networks, (parts.reconstruction, parts.kl, is_finite(gradient))
+        change, optimiser = _vae_optimiser(rate).update(gradient, optimiser, params)
+        state = optax.apply_updates(params, change), optimiser
+        return state, (parts.reconstruction, parts.kl, is_finite(gradient))
 
-    def learn(networks: Networks, updates: int):
-        networks, found = lax.scan(update, networks, split_each(keys, updates))
-        reconstruction, kl, finite = found
-        metrics: Metrics = dict(zip(VAE_METRICS, (reconstruction, kl), strict=True))
-        return UpdateStats.from_updates(reconstruction, metrics, finite), networks
+    in_training, otherwise = config.encoder.warmup_updates_per_step, int(config.encoder.keep_learning)
+    count = jnp.where(schedule.trains_vae(step), in_training, otherwise)
+    many = split_each(keys, max(in_training, otherwise))
 
-    def rest(networks: Networks):
-        if config.encoder.keep_learning:
-            return learn(networks, 1)
-        return UpdateStats.without_updates(*VAE_METRICS), networks
+    def each(number: Array, reached: tuple[Any, tuple[Array, ...]]) -> tuple[Any, tuple[Array, ...]]:
+        state, before = reached
+        state, found = update(state, many[number])
+        return state, tuple(x.at[number].set(one) for x, one in zip(before, found, strict=True))
 
-    return lax.cond(
-        schedule.trains_vae(step), lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, networks
-    )
+    # One loop of as many updates as there are: in branches, they would be traced and compiled twice.
+    nothing = tuple(jnp.zeros(len(many), kind) for kind in (jnp.float32, jnp.float32, bool))
+    start = (vector, networks.vae_optimiser), nothing
+    (vector, optimiser), (reconstruction, kl, finite) = lax.fori_loop(0, count, each, start)
+    metrics: Metrics = dict(zip(VAE_METRICS, (reconstruction, kl), strict=True))
+    networks = dataclasses.replace(networks, vae=tree(vector), vae_optimiser=optimiser)
+    return UpdateStats.from_updates(reconstruction, metrics, finite, count), networks
 
 
 def merge_shards(x: Array) -> Array:
