@@ -521,7 +521,9 @@ FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye*
       visible = k + 1,
       hidden = !any_of(layers->layer[k].coverage < WHOLE);
 
-  Meeting at[MEETINGS] = {{lanes(0), lanes(0), lanes(0)}};
+  const Meeting nowhere = {lanes(0), lanes(0), lanes(0)};
+  Meeting at[MEETINGS];
+  UNROLLED for (int k = 0; k < MEETINGS; ++k) at[k] = nowhere;
   Lanes factor[MEETINGS], shown = lanes(0), share = lanes(0), plane = lanes(-1);
   unsigned wanted = (1u << visible) - 1;
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) {
