@@ -141,8 +141,9 @@ class Place:
                 write_kept(file, serialize_executable.serialize(compiled)[0])
         # Left to JAX, a program would be traced in every run once its file here is not found: after an update, say.
         if was_kept_by_jax or file.is_file():
-            for copy in file.parent.glob(f"jit_{self.name}-*"):
-                copy.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # where nothing can be deleted any more
+                for copy in file.parent.glob(f"jit_{self.name}-*"):
+                    copy.unlink(missing_ok=True)
         return compiled
 
 

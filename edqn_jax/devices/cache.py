@@ -42,6 +42,9 @@ def enable_compilation_cache() -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     # Such as on a full disk: the program is not kept, and nothing else is lost.
     warnings.filterwarnings("ignore", "Error writing persistent compilation cache entry", UserWarning)
+    # Another command has deleted its copy of a program in the meantime, see `kept_programs`.
+    deleted = "(?s)Error reading persistent compilation cache entry for 'jit_kept_.*FileNotFoundError"
+    warnings.filterwarnings("ignore", deleted, UserWarning)
 
 
 def enabled_folder() -> Path | None:

@@ -67,7 +67,7 @@ def test_nothing_is_kept_where_it_may_not_be(variables: dict[str, str], folder: 
 
 def test_the_programs_used_longest_ago_go_once_there_are_too_many_bytes(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
-    read, written = (5, 0, 3, 2, 0, 1), (4, 0, 1, 2, 3, 1)  # days ago
+    read, written = (5, 1, 3, 2, 0, 4), (4, 2, 3, 2, 3, 0)  # days ago
     for number, ages in enumerate(zip(read, written, strict=True)):
         file = tmp_path / "folder" / f"{number}"
         file.write_bytes(bytes(100))
@@ -76,4 +76,4 @@ def test_the_programs_used_longest_ago_go_once_there_are_too_many_bytes(tmp_path
     cache._make_room(tmp_path, 600)
     assert len(list((tmp_path / "folder").iterdir())) == 6
     cache._make_room(tmp_path, 599)
-    assert sorted(file.name for file in (tmp_path / "folder").iterdir()) == ["1", "4"]
+    assert sorted(file.name for file in (tmp_path / "folder").iterdir()) == ["4", "5"]

@@ -67,6 +67,12 @@ def test_a_later_update_does_not_depend_on_how_many_the_warmup_makes() -> None:
     assert equal(updated(3, True, LATER)[2].vae, updated(1, True, LATER)[2].vae)
 
 
+@pytest.mark.whole
+def test_each_update_takes_its_own_keys_as_debug_checks() -> None:
+    with jax.debug_key_reuse(True):
+        assert updates_made(updated(3, True, IN_WARMUP)[2]) == 3
+
+
 def test_only_updates_that_were_made_are_told_of() -> None:
     loss = jnp.array([1.0, np.nan, 3.0, 100.0])
     finite = jnp.array([True, False, True, False])

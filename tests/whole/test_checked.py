@@ -41,6 +41,13 @@ def checked() -> Trainer:
     return trainer
 
 
+def test_nothing_is_found_in_a_training_with_an_encoder() -> None:
+    trainer = trainer_of((*CHECKED, "--env.sensor", "events"))
+    trainer.compile()
+    _, (_, losses) = trainer.chunk(trainer.init(0), 0)
+    assert jnp.isfinite(losses.metrics["reconstruction_loss"]).any()
+
+
 @pytest.fixture(scope="module")
 def learning(checked: Trainer) -> TrainState:
     """Returns the state after two chunks, in which both networks have learnt."""
