@@ -137,7 +137,7 @@ def update_vae(
             total, parts = vae.vae_loss(config.encoder, tree(params), sensed, batch.motion, batch.wanted, noise)
         return total * part, parts
 
-    def update(state: tuple[Array, Any], keys: Array):
+    def update(state: tuple[Any, Any], keys: Array):
         params, optimiser = state
         draw_keys, noise_keys = split_each(keys, 2)
         sample = lambda ring, key: samples.sample_batch(config.encoder, ring, kept, share, key, task, mirror)  # noqa: E731
