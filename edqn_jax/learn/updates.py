@@ -154,17 +154,17 @@ def update_vae(
 
     in_training, otherwise = config.encoder.warmup_updates_per_step, int(config.encoder.keep_learning)
     count = jnp.where(schedule.trains_vae(step), in_training, otherwise)
-    many = split_each(keys, max(in_training, otherwise))
+    most = max(in_training, otherwise)
     # As data: JAX's check for keys that are used twice cannot see that each turn of the loop takes its own.
-    data, kind = jax.random.key_data(many), jax.random.key_impl(many)
+    many = jax.random.key_data(split_each(keys, most))
 
     def each(number: Array, reached: tuple[Any, tuple[Array, ...]]) -> tuple[Any, tuple[Array, ...]]:
         state, before = reached
-        state, found = update(state, jax.random.wrap_key_data(data[number], impl=kind))
+        state, found = update(state, jax.random.wrap_key_data(many[number], impl=jax.random.key_impl(keys)))
         return state, tuple(x.at[number].set(one) for x, one in zip(before, found, strict=True))
 
     # One loop of as many updates as there are: in branches, they would be traced and compiled twice.
-    nothing = tuple(jnp.zeros(len(many), kind) for kind in (jnp.float32, jnp.float32, bool))
+    nothing = tuple(jnp.zeros(most, dtype) for dtype in (jnp.float32, jnp.float32, bool))
     start = (vector, networks.vae_optimiser), nothing
     (vector, optimiser), (reconstruction, kl, finite) = lax.fori_loop(0, count, each, start)
     metrics: Metrics = dict(zip(VAE_METRICS, (reconstruction, kl), strict=True))

@@ -42,6 +42,23 @@ def test_what_one_process_compiles_the_next_one_reads_and_what_is_damaged_is_com
 
 
 @pytest.mark.whole
+@pytest.mark.parametrize(
+    ("name", "error", "shown"),
+    [
+        ("jit_kept_flights", "FileNotFoundError", False),
+        ("jit_kept_flights", "ZstdError", True),
+        ("jit_flights", "FileNotFoundError", True),
+    ],
+)
+def test_a_copy_that_another_command_deleted_is_not_warned_of(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str, error: str, shown: bool
+) -> None:
+    message = f"Error reading persistent compilation cache entry for '{name}': {error}: [Errno 2]\nno such file"
+    monkeypatch.setattr(sys.modules[__name__], "COMMAND", f"{COMMAND}\nimport warnings\nwarnings.warn({message!r})")
+    outcome_of("Error reading persistent" if shown else "", XDG_CACHE_HOME=str(tmp_path))
+
+
+@pytest.mark.whole
 def test_nothing_is_read_that_others_could_have_written(tmp_path: Path) -> None:
     _, folder = outcome_of(XDG_CACHE_HOME=str(tmp_path))
     Path(folder).chmod(0o777)

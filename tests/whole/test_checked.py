@@ -41,16 +41,9 @@ def checked() -> Trainer:
     return trainer
 
 
-def test_nothing_is_found_in_a_training_with_an_encoder() -> None:
-    trainer = trainer_of((*CHECKED, "--env.sensor", "events"))
-    trainer.compile()
-    _, (_, losses) = trainer.chunk(trainer.init(0), 0)
-    assert jnp.isfinite(losses.metrics["reconstruction_loss"]).any()
-
-
 @pytest.fixture(scope="module")
 def learning(checked: Trainer) -> TrainState:
-    """Returns the state after two chunks, in which both networks have learnt."""
+    """Returns the state after two chunks, in which the Q-network has learnt; `blind` has no encoder."""
     state = checked.init(0)
     for first in (0, 16):
         state, (_, losses) = checked.chunk(state, first)
@@ -68,6 +61,13 @@ def fault(checked: Trainer, state: TrainState) -> str:
 
 def changed(state: TrainState, **leaves: Any) -> TrainState:
     return dataclasses.replace(state, actors=dataclasses.replace(state.actors, **leaves))
+
+
+def test_nothing_is_found_in_a_training_with_an_encoder() -> None:
+    trainer = trainer_of((*CHECKED, "--env.sensor", "events"))
+    trainer.compile()
+    _, (_, losses) = trainer.chunk(trainer.init(0), 0)
+    assert jnp.isfinite(losses.metrics["reconstruction_loss"]).any()
 
 
 def test_a_sound_run_learns_as_without_checks(learning: TrainState) -> None:
