@@ -105,7 +105,7 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + s->fields + 1));
   w->casters = malloc(sizeof(Caster) * (size_t)(uprights + s->spheres + 1));
   w->tilted = malloc(sizeof(Tilted) * (size_t)(uprights + 1));
-  w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)(uprights * HEIGHTS(c->across) * w->stride) + 1 : 1));
+  w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)(uprights * HEIGHTS(1, c->across) * w->stride) + 1 : 1));
   w->most = uprights + 1;
   w->found = malloc(sizeof(int) * (size_t)c->width * (size_t)(w->most + 1));
   if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres) return 0;
@@ -137,7 +137,7 @@ static void finish(const Camera* c, const Shapes* s, const Plane* planes, const 
 /* Draws one frame of a camera that is fixed to the body, [H, C]. */
 static void draw_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w, const Wave* waves,
                         const Plane* planes, float* picture) {
-  const int blocks = rounded_up(c->height) / LANES, of_shape = HEIGHTS(c->across) * w->stride;
+  const int blocks = rounded_up(c->height) / LANES, of_shape = HEIGHTS(1, c->across) * w->stride;
   Bounds bounds;
   bounds_of(c, e, &bounds);
   int visible = 0;
@@ -162,7 +162,7 @@ static void draw_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w,
     insert_fields(c, &w->fields, column, blocks * LANES, s->boxes + s->cylinders + s->spheres + s->planes, w->layers);
     for (int k = 0; k < w->found[column]; ++k) {
       const int n = w->covering[column * w->most + k];
-      insert_tilted(c, &w->tilted[n], c->u[column], w->v, w->heights + (size_t)n * of_shape + column, w->stride,
+      insert_tilted(c, &w->tilted[n].seen, c->u[column], w->v, w->heights + (size_t)n * of_shape + column, w->stride,
                     w->layers);
     }
     for (int n = 0; n < s->spheres; ++n) {

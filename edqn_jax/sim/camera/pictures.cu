@@ -21,9 +21,10 @@
 #define THREADS (COLUMNS * ROWS)
 #define AT_ONCE 16
 #define MEASURED_AT_ONCE 32
-#define TILTED_AT_ONCE 6
 #define TILTED_RESIDENT 4
-#define ROOM_FOR_HEIGHTS (TILTED_AT_ONCE * HEIGHTS(3) * COLUMNS) /* of fewer shapes at once, with more rays a pixel */
+#define STAGED 16                /* shapes that are set up at once, before a camera on the body */
+#define KEPT 64                  /* and that stay, 32 a word of `covering` */
+#define ROOM_FOR_HEIGHTS 6144    /* of them all: a box in all columns, with 16 rays across, takes half of it */
 
 typedef float Lanes;
 typedef int Mask;
@@ -222,14 +223,67 @@ FN int gather_tilted(const Frame* f, const Bounds* bounds, int base, int left, i
   return gather(gathered, n, shown);
 }
 
+/* Where the heights of a shape are, one for each column that it covers: arrays of `columns`, from column `first` on. */
+typedef struct {
+  int begins, first, columns;
+} Place;
+
+/* The shapes that a block has set up. */
+typedef struct {
+  Tilted staged[STAGED];
+  Seen shapes[KEPT];
+  Place places[KEPT];
+  unsigned covering[KEPT / 32][COLUMNS];
+  float heights[ROOM_FOR_HEIGHTS];
+} Stand;
+
+/* Sets up the shapes of a list from `k` on, as many as find room; returns how many. Every thread of the block calls it. */
+FN int set_up(const Frame* f, const Bounds* bounds, const int* list, int k, int found, int left, Stand* to) {
+  const Camera* c = &f->camera;
+  const int t = threadIdx.x;
+  int many = 0, used = 0, full = 0;
+  __syncthreads(); /* nobody reads those of the pass before */
+  if (t < COLUMNS)
+    for (int word = 0; word < KEPT / 32; ++word) to->covering[word][t] = 0;
+  while (!full && k + many < found) {
+    const int rest = found - k - many, room = KEPT - many;
+    const int staged = rest < room ? (rest < STAGED ? rest : STAGED) : room < STAGED ? room : STAGED;
+    if (t < staged) tilted_shape(c, &f->shapes, &f->eye, bounds, list[k + many + t], &to->staged[t]);
+    __syncthreads();
+    int fit = 0;
+    for (; fit < staged && !full; ++fit) {
+      const Tilted* p = &to->staged[fit];
+      const int first = p->first > left ? p->first - left : 0;
+      const int columns = (p->last < left + COLUMNS ? p->last - left : COLUMNS) - first;
+      const int next = used + HEIGHTS(p->seen.is_box, c->across) * columns;
+      full = next > ROOM_FOR_HEIGHTS;
+      if (full) break;
+      if (t == fit) {
+        const Place place = {used, first, columns};
+        to->places[many + fit] = place, to->shapes[many + fit] = p->seen;
+      }
+      used = next;
+    }
+    __syncthreads();
+    for (int task = t; task < fit * COLUMNS; task += THREADS) {
+      const int which = many + task / COLUMNS, x = task % COLUMNS, at = x - to->places[which].first;
+      if (at < 0 || at >= to->places[which].columns) continue;
+      float* of = to->heights + to->places[which].begins + at;
+      write_heights(c, &to->staged[task / COLUMNS], c->u[left + x], of, to->places[which].columns);
+      if (of[0] < of[to->places[which].columns]) atomicOr(&to->covering[which / 32][x], 1u << which % 32);
+    }
+    __syncthreads();
+    many += fit, full |= many == KEPT;
+  }
+  return many;
+}
+
 static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(const Batch batch) {
   __shared__ Frame frame;
   __shared__ Wave waves[MOST_WAVES];
   __shared__ Bounds bounds;
   __shared__ Gathered gathered;
-  __shared__ Tilted shapes[TILTED_AT_ONCE];
-  __shared__ unsigned covering[COLUMNS];
-  __shared__ float heights[ROOM_FOR_HEIGHTS];
+  __shared__ Stand stand;
   const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
   const uint32_t m = blockIdx.x / strips;
   const int left = (int)(blockIdx.x % strips) * COLUMNS, right = left + COLUMNS;
@@ -243,12 +297,11 @@ static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(c
   __syncthreads();
 
   const int uprights = s->boxes + s->cylinders, across = column_of(t), column = left + across;
-  const int in_image = column < c->width, of_shape = HEIGHTS(c->across) * COLUMNS;
-  const int at_once = most(1, least(TILTED_AT_ONCE, ROOM_FOR_HEIGHTS / of_shape));
+  const int in_image = column < c->width;
   const float u = c->u[in_image ? column : c->width - 1];
   float ahead[3];
   ray_ahead(e, u, ahead);
-  int found = 0, listed = 0, kept = 0; /* listed, kept: all that is shown is in the list, in shared memory */
+  int found = 0, many = 0, listed = 0, kept = 0; /* listed, kept: all that is shown is in the list, in shared memory */
   for (int first = 0; first < c->height; first += ROWS) {
     const int row = first + row_of(t), drawn = in_image && row < c->height;
     const float v = c->v[row < c->height ? row : c->height - 1];
@@ -258,31 +311,18 @@ static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(c
       if (!listed) {
         found = gather_tilted(&frame, &bounds, base, left, right, &gathered);
       }
-      for (int k = 0; k < found; k += at_once) {
-        const int many = found - k < at_once ? found - k : at_once;
-        if (!kept) {
-          __syncthreads();
-          if (t < COLUMNS) covering[t] = 0;
-          if (t < many) tilted_shape(c, s, e, &bounds, gathered.list[k + t], &shapes[t]);
-          __syncthreads();
-          for (int task = t; task < many * COLUMNS; task += THREADS) {
-            const int which = task / COLUMNS, x = task % COLUMNS, at = left + x;
-            if (at < shapes[which].first || at >= shapes[which].last) continue;
-            float* of = heights + which * of_shape + x;
-            write_heights(c, &shapes[which], c->u[at], of, COLUMNS);
-            if (of[0] < of[COLUMNS]) atomicOr(&covering[x], 1u << which);
-          }
-          __syncthreads();
-        }
+      for (int k = 0; k < found; k += many) {
+        if (!kept) many = set_up(&frame, &bounds, gathered.list, k, found, left, &stand);
         if (drawn)
-          for (unsigned left_over = covering[across]; left_over; left_over &= left_over - 1) {
-            const int which = __ffs((int)left_over) - 1;
-            const float* of = heights + which * of_shape + across;
-            if (v >= of[0] && v <= of[COLUMNS]) insert_rows(c, &shapes[which], u, v, of, COLUMNS, &layers);
-          }
+          for (int word = 0; word < (many + 31) / 32; ++word)
+            for (unsigned left_over = stand.covering[word][across]; left_over; left_over &= left_over - 1) {
+              const int which = 32 * word + __ffs((int)left_over) - 1, stride = stand.places[which].columns;
+              const float* of = stand.heights + stand.places[which].begins + across - stand.places[which].first;
+              if (v >= of[0] && v <= of[stride]) insert_rows(c, &stand.shapes[which], u, v, of, stride, &layers);
+            }
       }
     }
-    listed = uprights <= THREADS, kept = listed && found <= at_once;
+    listed = uprights <= THREADS, kept = listed && found <= many;
     if (!drawn) continue;
     for (int n = 0; n < s->spheres; ++n) insert_sphere(c, s, e, n, ahead, v, &layers);
     batch.pictures[((int64_t)m * c->height + row) * c->width + column] =

@@ -13,20 +13,32 @@
 #define INLINED __attribute__((always_inline))
 #define MOST_CORNERS 8 /* of a rectangle that a plane cuts: 5, or twice 4 of numbers that are not finite */
 
-/* A face of a box in the image, convex, and what is seen there. */
+/* A face of a box in the image, convex. */
 typedef struct {
   int corners;
   float u[MOST_CORNERS], v[MOST_CORNERS];
-  float at_zero, per_u, per_v, bright; /* closeness there, its changes; brightness */
 } Face;
+
+/* What is seen on a face: closeness at the image's middle, its changes; brightness. */
+typedef struct {
+  float at_zero, per_u, per_v, bright;
+} Front;
+
+/* What pixels need of a box or a cylinder. */
+typedef struct {
+  int is_box, number, faces;                          /* of all; how many are seen */
+  float origin[3], forward[3], right[3], up[3];       /* in its own frame: the eye from its middle; the image's axes */
+  float radius, half_height, value, sun[2], end_bright; /* of a cylinder */
+  Front front[3];                                     /* of a box, whose far faces the eye does not see */
+} Seen;
 
 /* A box or a cylinder, in its own frame. */
 typedef struct {
-  int is_box, number, first, last, faces; /* of all; columns that it may cover, the last excluded; faces seen */
-  float origin[3], forward[3], right[3], up[3]; /* the eye from its middle; the image's axes */
-  float half[3], radius, value, sun[2];
+  Seen seen;
+  int first, last; /* columns that it may cover, the last excluded */
+  float half[3];
   Turn turn; /* of its axes */
-  float bright[3]; /* of the faces that the eye may see; of a cylinder the third, of its end */
+  float bright[3]; /* of the faces that the eye may see */
   Face face[6];    /* of a cylinder those of the box around it, which faces the eye; all six from within */
 } Tilted;
 
@@ -38,8 +50,8 @@ typedef struct {
 
 /* Rays d meet a cylinder of radius r at closeness k where |o k + d| = r k, with the eye at o from its axis: solved
  * without a division by what differs between rays. Its end, where the eye is beyond it, lies in a plane. */
-FN Met meet_cylinder(const Camera* c, const Tilted* p, float u, Lanes v) {
-  const float x = p->origin[0], z = p->origin[2], r2 = p->radius * p->radius, beyond = fabsf(z) - p->half[2];
+FN Met meet_cylinder(const Camera* c, const Seen* p, float u, Lanes v) {
+  const float x = p->origin[0], z = p->origin[2], r2 = p->radius * p->radius, beyond = fabsf(z) - p->half_height;
   const Lanes dx = (p->forward[0] + u * p->right[0]) + v * p->up[0];
   const Lanes dy = (p->forward[1] + u * p->right[1]) + v * p->up[1];
   const Lanes dz = (p->forward[2] + u * p->right[2]) + v * p->up[2];
@@ -47,7 +59,7 @@ FN Met meet_cylinder(const Camera* c, const Tilted* p, float u, Lanes v) {
   if (x > p->radius) {
     const Lanes under = r2 * (dx * dx + dy * dy) - x * x * dy * dy;
     const Lanes k = (roots(greater(under, lanes(0))) - x * dx) * (1 / (x * x - r2));
-    met.hit = (under > 0) & (k > 0) & (absolute(z * k + dz) <= p->half[2] * k);
+    met.hit = (under > 0) & (k > 0) & (absolute(z * k + dz) <= p->half_height * k);
     if (any_of(met.hit)) {
       const Lanes lit = ((x * k + dx) * p->sun[0] + dy * p->sun[1]) / (p->radius * greater(k, lanes(TINY)));
       met.closeness = k, met.bright = p->value * (c->ambient + (1 - c->ambient) * greater(lit, lanes(0)));
@@ -57,57 +69,65 @@ FN Met meet_cylinder(const Camera* c, const Tilted* p, float u, Lanes v) {
     const Lanes k = dz / (z > 0 ? -beyond : beyond), px = x * k + dx;
     const Mask on_end = (k > 0) & (px * px + dy * dy <= r2 * k * k);
     met.hit |= on_end, met.closeness = pick(on_end, k, met.closeness);
-    met.bright = pick(on_end, lanes(p->bright[2]), met.bright);
+    met.bright = pick(on_end, lanes(p->end_bright), met.bright);
   }
   return met;
 }
 
 /* Sets a face of a box from its axis and side: what of it is in front of the near plane; returns whether any is. */
 FN int face_of(const Tilted* p, int axis, float side, Face* f) {
+  const Seen* q = &p->seen;
   const int one = (axis + 1) % 3, other = (axis + 2) % 3;
   float at[4][3], ahead[4];
   for (int i = 0; i < 4; ++i) {
-    at[i][axis] = side * p->half[axis] - p->origin[axis];
-    at[i][one] = (i == 1 || i == 2 ? p->half[one] : -p->half[one]) - p->origin[one];
-    at[i][other] = (i >= 2 ? p->half[other] : -p->half[other]) - p->origin[other];
-    ahead[i] = dot3(at[i], p->forward);
+    at[i][axis] = side * p->half[axis] - q->origin[axis];
+    at[i][one] = (i == 1 || i == 2 ? p->half[one] : -p->half[one]) - q->origin[one];
+    at[i][other] = (i >= 2 ? p->half[other] : -p->half[other]) - q->origin[other];
+    ahead[i] = dot3(at[i], q->forward);
   }
   f->corners = 0;
   for (int i = 0; i < 4; ++i) {
     const int j = (i + 1) & 3;
     if (ahead[i] >= CUT_M) {
-      f->u[f->corners] = dot3(at[i], p->right) / ahead[i], f->v[f->corners++] = dot3(at[i], p->up) / ahead[i];
+      f->u[f->corners] = dot3(at[i], q->right) / ahead[i], f->v[f->corners++] = dot3(at[i], q->up) / ahead[i];
     }
     if ((ahead[i] >= CUT_M) != (ahead[j] >= CUT_M)) {
       const float share = (CUT_M - ahead[i]) / (ahead[j] - ahead[i]);
       float cut[3];
       for (int k = 0; k < 3; ++k) cut[k] = at[i][k] + share * (at[j][k] - at[i][k]);
-      f->u[f->corners] = dot3(cut, p->right) / CUT_M, f->v[f->corners++] = dot3(cut, p->up) / CUT_M;
+      f->u[f->corners] = dot3(cut, q->right) / CUT_M, f->v[f->corners++] = dot3(cut, q->up) / CUT_M;
     }
   }
-  const float plane = inverse(side * p->half[axis] - p->origin[axis]);
-  f->at_zero = p->forward[axis] * plane, f->per_u = p->right[axis] * plane, f->per_v = p->up[axis] * plane;
-  f->bright = p->bright[axis];
   return f->corners > 2;
+}
+
+/* Returns what is seen on a face of a box. */
+FN Front front_of(const Tilted* p, int axis, float side) {
+  const Seen* q = &p->seen;
+  const float plane = inverse(side * p->half[axis] - q->origin[axis]);
+  const Front front = {q->forward[axis] * plane, q->right[axis] * plane, q->up[axis] * plane, p->bright[axis]};
+  return front;
 }
 
 /* Sets the faces that the eye may see and the columns that they cover; returns whether there are any. */
 FN int faces_of(const Camera* c, Tilted* p) {
+  Seen* q = &p->seen;
   float left = NOWHERE, right = -NOWHERE;
   int outside = 0;
-  for (int k = 0; k < 3; ++k) outside |= fabsf(p->origin[k]) > p->half[k];
-  if (!outside && p->is_box) return 0;
-  p->faces = 0;
+  for (int k = 0; k < 3; ++k) outside |= fabsf(q->origin[k]) > p->half[k];
+  if (!outside && q->is_box) return 0;
+  q->faces = 0;
   for (int k = 0; k < 3; ++k)
     for (float side = -1; side < 2; side += 2) {
-      Face* f = &p->face[p->faces];
-      if (outside && !(side * p->origin[k] > p->half[k])) continue;
+      Face* f = &p->face[q->faces];
+      if (outside && !(side * q->origin[k] > p->half[k])) continue;
       if (!face_of(p, k, side, f)) continue;
       for (int i = 0; i < f->corners; ++i) left = least(left, f->u[i]), right = most(right, f->u[i]);
-      ++p->faces;
+      if (q->is_box) q->front[q->faces] = front_of(p, k, side);
+      ++q->faces;
     }
   columns_between(c, left, right, &p->first, &p->last);
-  return p->faces && p->first < p->last;
+  return q->faces && p->first < p->last;
 }
 
 /* The heights between which LANES columns at `u` are on a face; empty if the first is above the second. */
@@ -149,15 +169,17 @@ FN int out_of_bounds(const Bounds* b, const float* to, float radius, float half)
 
 /* Sets brightness of a shape with these axes; depth images do without. */
 FN void light_tilted(const Camera* c, const Shapes* s, const Eye* e, const float axes[3][3], Tilted* p) {
+  Seen* q = &p->seen;
   memset(p->bright, 0, sizeof p->bright);
   if (!e->weights) return;
-  const float* albedo = p->is_box ? s->box_albedo + 3 * p->number : s->cylinder_albedo + 3 * (p->number - s->boxes);
-  p->value = dot3(albedo, e->weights);
-  p->sun[0] = dot3(axes[0], c->sun), p->sun[1] = dot3(axes[1], c->sun);
+  const float* albedo = q->is_box ? s->box_albedo + 3 * q->number : s->cylinder_albedo + 3 * (q->number - s->boxes);
+  q->value = dot3(albedo, e->weights);
+  q->sun[0] = dot3(axes[0], c->sun), q->sun[1] = dot3(axes[1], c->sun);
   for (int k = 0; k < 3; ++k) {
-    const float sign = p->origin[k] > 0 ? 1 : -1;
-    p->bright[k] = p->value * shade(c, sign * axes[k][0], sign * axes[k][1], sign * axes[k][2]);
+    const float sign = q->origin[k] > 0 ? 1 : -1;
+    p->bright[k] = q->value * shade(c, sign * axes[k][0], sign * axes[k][1], sign * axes[k][2]);
   }
+  q->end_bright = p->bright[2];
 }
 
 /* Returns whether upright shape `n`, boxes first, may be seen, and what pixels need of it. */
@@ -174,10 +196,11 @@ FN INLINED int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, cons
   const float cos = is_box ? cosf(s->box_yaw[i]) : on_axis ? 1 : away[0] / flat;
   const float sin = is_box ? sinf(s->box_yaw[i]) : on_axis ? 0 : away[1] / flat;
   const float axes[3][3] = {{cos, sin, 0}, {-sin, cos, 0}, {0, 0, 1}};
-  p->is_box = is_box, p->number = n, p->radius = radius;
+  Seen* q = &p->seen;
+  q->is_box = is_box, q->number = n, q->radius = radius, q->half_height = tall;
   for (int k = 0; k < 3; ++k) {
-    p->origin[k] = dot3(axes[k], away), p->forward[k] = dot3(axes[k], e->forward);
-    p->right[k] = dot3(axes[k], e->right), p->up[k] = dot3(axes[k], e->up);
+    q->origin[k] = dot3(axes[k], away), q->forward[k] = dot3(axes[k], e->forward);
+    q->right[k] = dot3(axes[k], e->right), q->up[k] = dot3(axes[k], e->up);
     p->half[k] = is_box ? half[k] : k < 2 ? radius : tall;
   }
   p->turn.cos = cos, p->turn.sin = sin;
@@ -188,7 +211,7 @@ FN INLINED int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, cons
 /* The heights between which LANES columns at `u` are on any face of a shape; empty if the first is above the second. */
 FN void heights_of_shape(const Tilted* p, Lanes u, Lanes* low, Lanes* high) {
   *low = lanes(NOWHERE), *high = lanes(-NOWHERE);
-  for (int f = 0; f < p->faces; ++f) {
+  for (int f = 0; f < p->seen.faces; ++f) {
     Lanes from, to;
     heights_on(&p->face[f], u, &from, &to);
     *low = lesser(*low, from), *high = greater(*high, to);
@@ -197,24 +220,24 @@ FN void heights_of_shape(const Tilted* p, Lanes u, Lanes* low, Lanes* high) {
 
 /* Lowers `nearest` of LANES rows at heights `v` of a column to the depth at which their middle rays meet a shape. */
 FN Lanes nearer_tilted(const Shapes* s, const Eye* e, const Tilted* p, const float* ahead, Lanes v, Lanes nearest) {
-  const Turn none = {1, 0}, turn = p->is_box ? p->turn : none;
+  const Turn none = {1, 0}, turn = p->seen.is_box ? p->turn : none;
   const Lanes dx = ahead[0] + e->up[0] * v, dy = ahead[1] + e->up[1] * v, dz = ahead[2] + e->up[2] * v;
   Lanes from, to;
-  beside(s, e, p->number, turn, dx, dy, &from, &to);
-  return nearer_upright(level_of(s, e, p->number), from, to, inverses(dz), nearest);
+  beside(s, e, p->seen.number, turn, dx, dy, &from, &to);
+  return nearer_upright(level_of(s, e, p->seen.number), from, to, inverses(dz), nearest);
 }
 
-#define HEIGHTS(across) (2 + 12 * (across)) /* arrays of `stride` that `write_heights` writes at most */
+#define HEIGHTS(is_box, across) (2 + ((is_box) ? 6 : 2) * (across)) /* arrays of `stride` that it writes at most */
 
 /* Writes what LANES columns at `u` need of a shape, in arrays that are `stride` apart: the heights between which rows
  * may show it, then low and high of every ray across, of a box for each of its faces. */
 FN void write_heights(const Camera* c, const Tilted* p, Lanes u, float* heights, int stride) {
   Lanes lowest = lanes(NOWHERE), highest = lanes(-NOWHERE), low, high;
   float* to = heights + 2 * stride;
-  for (int f = 0; f < (p->is_box ? p->faces : 1); ++f)
+  for (int f = 0; f < (p->seen.is_box ? p->seen.faces : 1); ++f)
     for (int a = 0; a < c->across; ++a, to += 2 * stride) {
       const Lanes at = u + c->pitch * ((a + 0.5f) / c->across - 0.5f);
-      if (p->is_box)
+      if (p->seen.is_box)
         heights_on(&p->face[f], at, &low, &high);
       else
         heights_of_shape(p, at, &low, &high);
@@ -225,11 +248,11 @@ FN void write_heights(const Camera* c, const Tilted* p, Lanes u, float* heights,
 }
 
 /* Adds what LANES rows at `high` of a column at `u` show of a box. */
-FN void insert_box(const Camera* c, const Tilted* p, float u, Lanes high, const float* heights, int stride,
+FN void insert_box(const Camera* c, const Seen* p, float u, Lanes high, const float* heights, int stride,
                    Layers* layers) {
   Lanes count = lanes(0), closeness = lanes(0), value = lanes(0);
   for (int n = 0; n < p->faces; ++n) {
-    const Face* f = &p->face[n];
+    const Front* f = &p->front[n];
     Lanes on_face = lanes(0);
     for (int a = 0; a < c->across; ++a, heights += 2 * stride) {
       const float low = heights[0], top = heights[stride];
@@ -251,7 +274,7 @@ FN void insert_box(const Camera* c, const Tilted* p, float u, Lanes high, const 
 }
 
 /* The same of a cylinder. */
-FN void insert_cylinder(const Camera* c, const Tilted* p, float u, Lanes high, const float* heights, int stride,
+FN void insert_cylinder(const Camera* c, const Seen* p, float u, Lanes high, const float* heights, int stride,
                         Layers* layers) {
   Lanes count = lanes(0), closeness = lanes(0), value = lanes(0);
   for (int a = 0; a < c->across; ++a) {
@@ -288,7 +311,7 @@ FN Extent extent_of_sphere(const Camera* c, const Shapes* s, const Eye* e, int n
 }
 
 /* Adds what LANES rows at `high` of a column at `u` show of a shape, which `write_heights` wrote `heights` of. */
-FN void insert_rows(const Camera* c, const Tilted* p, float u, Lanes high, const float* heights, int stride,
+FN void insert_rows(const Camera* c, const Seen* p, float u, Lanes high, const float* heights, int stride,
                     Layers* layers) {
   if (p->is_box)
     insert_box(c, p, u, high, heights + 2 * stride, stride, layers);
@@ -297,7 +320,7 @@ FN void insert_rows(const Camera* c, const Tilted* p, float u, Lanes high, const
 }
 
 /* Adds a shape to the layers of the rows of a column at `u`, of heights `v` and in blocks of LANES. */
-FN void insert_tilted(const Camera* c, const Tilted* p, float u, const float* v, const float* heights, int stride,
+FN void insert_tilted(const Camera* c, const Seen* p, float u, const float* v, const float* heights, int stride,
                       Layers* layers) {
   for (int first = 0; first < c->height; first += LANES, ++layers) {
     const int last = first + LANES < c->height ? first + LANES - 1 : c->height - 1;
