@@ -2,8 +2,8 @@
  * registers them). What they are made of is in `pictures.h`; those of a camera on the body, in `tilted.h`.
  *
  * A block of threads draws a strip of COLUMNS columns of a frame, ROWS rows of it at a time, a thread a pixel. First it
- * gathers the upright shapes that the strip may show; then, AT_ONCE of them at a time, what the strip's columns need of
- * them goes into shared memory, from which the pixels read it. Written in C as CPUs have it too, so that a test can run
+ * gathers the upright shapes that the strip may show; then what its columns need of them goes into shared memory, STAGED
+ * shapes at a time and for each the columns that it covers alone, from which the pixels read it. Written in C as CPUs have it too, so that a test can run
  * the kernels on one (`tests/oracles/cuda_on_cpu.h`).
  */
 
@@ -19,12 +19,12 @@
 #define ROWS 4
 #define RESIDENT 8 /* blocks that a multiprocessor holds at once: as many as its registers allow */
 #define THREADS (COLUMNS * ROWS)
-#define AT_ONCE 16
+#define STAGED 16 /* shapes that are set up at once */
+#define KEPT 64   /* and that stay, 32 a word of `covering`, as far as there is room for what columns need of them: */
+#define ROOM 5632 /* floats of a level camera, 12 for each shape and column */
+#define TILTED_ROOM 6144 /* of one on the body; a box in all columns, with 16 rays across a pixel, takes half of it */
 #define MEASURED_AT_ONCE 32
 #define TILTED_RESIDENT 4
-#define STAGED 16                /* shapes that are set up at once, before a camera on the body */
-#define KEPT 64                  /* and that stay, 32 a word of `covering` */
-#define ROOM_FOR_HEIGHTS 6144    /* of them all: a box in all columns, with 16 rays across, takes half of it */
 
 typedef float Lanes;
 typedef int Mask;
@@ -91,13 +91,86 @@ FN int gather(Gathered* g, int n, int shown) {
 FN int column_of(int t) { return t % 8 + t / 32 % (COLUMNS / 8) * 8; }
 FN int row_of(int t) { return t / 8 % 4 + t / 128 * 4; }
 
+/* Where numbers of a shape are, of each column that it covers: arrays of `columns`, from column `first` of the strip on. */
+typedef struct {
+  int begins, first, columns;
+} Place;
+
+/* The shapes of a list that a block has set up. */
+typedef struct {
+  Place places[KEPT];
+  unsigned covering[KEPT / 32][COLUMNS]; /* which of them, a bit each */
+} Book;
+
+/* Begins anew. Every thread of the block calls it, as it does the next two. */
+FN void clear(Book* book) {
+  __syncthreads(); /* nobody reads the shapes of the pass before */
+  if (threadIdx.x < COLUMNS)
+    for (int word = 0; word < KEPT / 32; ++word) book->covering[word][threadIdx.x] = 0;
+}
+
+/* Returns how many shapes are set up next, where `rest` are left and `many` are kept. */
+FN int next_of(int rest, int many) {
+  const int most = KEPT - many < STAGED ? KEPT - many : STAGED;
+  return rest < most ? rest : most;
+}
+
+/* Gives a shape that covers the columns [first, last) of the image its place, `arrays` of them, and returns whether there
+ * is room; `used` floats are taken. */
+FN int reserve(Book* book, int which, int first, int last, int left, int arrays, int room, int* used) {
+  const int from = first > left ? first - left : 0, to = last < left + COLUMNS ? last - left : COLUMNS;
+  const Place place = {*used, from, to - from};
+  if (*used + arrays * place.columns > room) return 0;
+  if (threadIdx.x == which) book->places[which] = place;
+  *used += arrays * place.columns;
+  return 1;
+}
+
+/* Returns where the numbers of a shape begin in column `x` of the strip; -1 where it covers none. */
+FN int begin_in(const Place* p, int x) {
+  return x < p->first || x >= p->first + p->columns ? -1 : p->begins + x - p->first;
+}
+
+/* The upright shapes before a level camera. */
+typedef struct {
+  Book book;
+  Upright staged[STAGED];
+  float numbers[ROOM];
+} LevelShapes;
+
+/* Sets up the shapes of a list from `k` on, as many as find room; returns how many. Every thread of the block calls it. */
+FN int set_up(const Frame* f, const int* list, int k, int found, int left, LevelShapes* to) {
+  const Camera* c = &f->camera;
+  const int t = threadIdx.x;
+  int many = 0, used = 0, full = 0;
+  clear(&to->book);
+  while (!full && k + many < found) {
+    const int staged = next_of(found - k - many, many);
+    if (t < staged) upright(c, &f->shapes, &f->eye, list[k + many + t], &to->staged[t]);
+    __syncthreads();
+    int fit = 0;
+    while (fit < staged && reserve(&to->book, many + fit, to->staged[fit].first, to->staged[fit].last, left, NUMBERS, ROOM,
+                                   &used))
+      ++fit;
+    __syncthreads();
+    for (int task = t; task < fit * COLUMNS; task += THREADS) {
+      const int which = many + task / COLUMNS, x = task % COLUMNS, begins = begin_in(&to->book.places[which], x);
+      if (begins < 0) continue;
+      const int stride = to->book.places[which].columns;
+      sides(c, &f->eye, &to->staged[task / COLUMNS], c->u[left + x], to->numbers + begins, stride);
+      if (to->numbers[begins + SHARE * stride] > 0) atomicOr(&to->book.covering[which / 32][x], 1u << which % 32);
+    }
+    __syncthreads();
+    many += fit, full = fit < staged || many == KEPT;
+  }
+  return many;
+}
+
 static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch batch) {
   __shared__ Frame frame;
   __shared__ Wave waves[MOST_WAVES];
   __shared__ Gathered gathered;
-  __shared__ Upright shapes[AT_ONCE];
-  __shared__ unsigned covering[COLUMNS]; /* which of the shapes, a bit each */
-  __shared__ float numbers[AT_ONCE * NUMBERS * COLUMNS];
+  __shared__ LevelShapes shapes;
   const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
   const uint32_t m = blockIdx.x / strips;
   const int left = (int)(blockIdx.x % strips) * COLUMNS, right = left + COLUMNS;
@@ -112,7 +185,7 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
   const int in_image = column < c->width;
   float ahead[3];
   ray_ahead(e, c->u[in_image ? column : c->width - 1], ahead);
-  int found = 0, kept = 0; /* kept: all that is shown stays in shared memory */
+  int found = 0, many = 0, kept = 0; /* kept: all that is shown stays in shared memory */
   for (int first = 0; first < c->height; first += ROWS) {
     const int row = first + row_of(t), drawn = in_image && row < c->height;
     const float dz = c->v[row < c->height ? row : c->height - 1];
@@ -128,29 +201,18 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
         __syncthreads(); /* nobody is at the list of the pass before */
         found = gather(&gathered, n, shown);
       }
-      for (int k = 0; k < found; k += AT_ONCE) {
-        const int many = found - k < AT_ONCE ? found - k : AT_ONCE;
-        if (!kept) {
-          __syncthreads();
-          if (t < COLUMNS) covering[t] = 0;
-          if (t < many) upright(c, s, e, gathered.list[k + t], &shapes[t]);
-          __syncthreads();
-          for (int task = t; task < many * COLUMNS; task += THREADS) {
-            const int which = task / COLUMNS, x = task % COLUMNS, at = left + x;
-            if (at < shapes[which].first || at >= shapes[which].last) continue;
-            float* of = numbers + which * NUMBERS * COLUMNS + x;
-            sides(c, e, &shapes[which], c->u[at], of, COLUMNS);
-            if (of[SHARE * COLUMNS] > 0) atomicOr(&covering[x], 1u << which);
-          }
-          __syncthreads();
-        }
+      for (int k = 0; k < found; k += many) {
+        if (!kept) many = set_up(&frame, gathered.list, k, found, left, &shapes);
         if (drawn)
-          for (unsigned left_over = covering[across]; left_over; left_over &= left_over - 1)
-            insert_side(c, numbers + (__ffs((int)left_over) - 1) * NUMBERS * COLUMNS + across, COLUMNS, row, &layers);
+          for (int word = 0; word < (many + 31) / 32; ++word)
+            for (unsigned left_over = shapes.book.covering[word][across]; left_over; left_over &= left_over - 1) {
+              const Place* at = &shapes.book.places[32 * word + __ffs((int)left_over) - 1];
+              insert_side(c, shapes.numbers + begin_in(at, across), at->columns, row, &layers);
+            }
       }
     }
     if (uprights == 0) __syncthreads(); /* waves and planes are there */
-    kept = uprights <= THREADS && found <= AT_ONCE;
+    kept = uprights <= THREADS && found <= many;
     if (drawn)
       batch.pictures[((int64_t)m * c->height + row) * c->width + column] =
           blend(c, s, frame.planes, e, waves, 0, 0, ahead, dz, &layers);
@@ -223,57 +285,43 @@ FN int gather_tilted(const Frame* f, const Bounds* bounds, int base, int left, i
   return gather(gathered, n, shown);
 }
 
-/* Where the heights of a shape are, one for each column that it covers: arrays of `columns`, from column `first` on. */
+/* The upright shapes before a camera on the body. */
 typedef struct {
-  int begins, first, columns;
-} Place;
-
-/* The shapes that a block has set up. */
-typedef struct {
+  Book book;
   Tilted staged[STAGED];
   Seen shapes[KEPT];
-  Place places[KEPT];
-  unsigned covering[KEPT / 32][COLUMNS];
-  float heights[ROOM_FOR_HEIGHTS];
-} Stand;
+  float heights[TILTED_ROOM];
+} TiltedShapes;
 
-/* Sets up the shapes of a list from `k` on, as many as find room; returns how many. Every thread of the block calls it. */
-FN int set_up(const Frame* f, const Bounds* bounds, const int* list, int k, int found, int left, Stand* to) {
+/* As `set_up`. */
+FN int set_up_tilted(const Frame* f, const Bounds* bounds, const int* list, int k, int found, int left,
+                     TiltedShapes* to) {
   const Camera* c = &f->camera;
   const int t = threadIdx.x;
   int many = 0, used = 0, full = 0;
-  __syncthreads(); /* nobody reads those of the pass before */
-  if (t < COLUMNS)
-    for (int word = 0; word < KEPT / 32; ++word) to->covering[word][t] = 0;
+  clear(&to->book);
   while (!full && k + many < found) {
-    const int rest = found - k - many, room = KEPT - many;
-    const int staged = rest < room ? (rest < STAGED ? rest : STAGED) : room < STAGED ? room : STAGED;
+    const int staged = next_of(found - k - many, many);
     if (t < staged) tilted_shape(c, &f->shapes, &f->eye, bounds, list[k + many + t], &to->staged[t]);
     __syncthreads();
     int fit = 0;
-    for (; fit < staged && !full; ++fit) {
+    for (; fit < staged; ++fit) {
       const Tilted* p = &to->staged[fit];
-      const int first = p->first > left ? p->first - left : 0;
-      const int columns = (p->last < left + COLUMNS ? p->last - left : COLUMNS) - first;
-      const int next = used + HEIGHTS(p->seen.is_box, c->across) * columns;
-      full = next > ROOM_FOR_HEIGHTS;
-      if (full) break;
-      if (t == fit) {
-        const Place place = {used, first, columns};
-        to->places[many + fit] = place, to->shapes[many + fit] = p->seen;
-      }
-      used = next;
+      const int arrays = HEIGHTS(p->seen.is_box, c->across);
+      if (!reserve(&to->book, many + fit, p->first, p->last, left, arrays, TILTED_ROOM, &used)) break;
+      if (t == fit) to->shapes[many + fit] = p->seen;
     }
     __syncthreads();
     for (int task = t; task < fit * COLUMNS; task += THREADS) {
-      const int which = many + task / COLUMNS, x = task % COLUMNS, at = x - to->places[which].first;
-      if (at < 0 || at >= to->places[which].columns) continue;
-      float* of = to->heights + to->places[which].begins + at;
-      write_heights(c, &to->staged[task / COLUMNS], c->u[left + x], of, to->places[which].columns);
-      if (of[0] < of[to->places[which].columns]) atomicOr(&to->covering[which / 32][x], 1u << which % 32);
+      const int which = many + task / COLUMNS, x = task % COLUMNS, begins = begin_in(&to->book.places[which], x);
+      if (begins < 0) continue;
+      const int stride = to->book.places[which].columns;
+      float* of = to->heights + begins;
+      write_heights(c, &to->staged[task / COLUMNS], c->u[left + x], of, stride);
+      if (of[0] < of[stride]) atomicOr(&to->book.covering[which / 32][x], 1u << which % 32);
     }
     __syncthreads();
-    many += fit, full |= many == KEPT;
+    many += fit, full = fit < staged || many == KEPT;
   }
   return many;
 }
@@ -283,7 +331,7 @@ static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(c
   __shared__ Wave waves[MOST_WAVES];
   __shared__ Bounds bounds;
   __shared__ Gathered gathered;
-  __shared__ Stand stand;
+  __shared__ TiltedShapes shapes;
   const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
   const uint32_t m = blockIdx.x / strips;
   const int left = (int)(blockIdx.x % strips) * COLUMNS, right = left + COLUMNS;
@@ -312,13 +360,15 @@ static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(c
         found = gather_tilted(&frame, &bounds, base, left, right, &gathered);
       }
       for (int k = 0; k < found; k += many) {
-        if (!kept) many = set_up(&frame, &bounds, gathered.list, k, found, left, &stand);
+        if (!kept) many = set_up_tilted(&frame, &bounds, gathered.list, k, found, left, &shapes);
         if (drawn)
           for (int word = 0; word < (many + 31) / 32; ++word)
-            for (unsigned left_over = stand.covering[word][across]; left_over; left_over &= left_over - 1) {
-              const int which = 32 * word + __ffs((int)left_over) - 1, stride = stand.places[which].columns;
-              const float* of = stand.heights + stand.places[which].begins + across - stand.places[which].first;
-              if (v >= of[0] && v <= of[stride]) insert_rows(c, &stand.shapes[which], u, v, of, stride, &layers);
+            for (unsigned left_over = shapes.book.covering[word][across]; left_over; left_over &= left_over - 1) {
+              const int which = 32 * word + __ffs((int)left_over) - 1;
+              const Place* at = &shapes.book.places[which];
+              const float* of = shapes.heights + begin_in(at, across);
+              if (v >= of[0] && v <= of[at->columns])
+                insert_rows(c, &shapes.shapes[which], u, v, of, at->columns, &layers);
             }
       }
     }
