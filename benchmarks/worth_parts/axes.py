@@ -42,6 +42,11 @@ SUNNY_LUX, SHADE = 10_000.0, 0.01
 """Light of a clear day, as much as there is here; brightness in the shade as a share of that in the sun."""
 SHADOWS = {"no shadows": False, "shadows": True}
 """By condition: `camera.shadows`."""
+IN_LIGHT = {
+    "no shading": {"camera": {"ambient": 1.0}},
+    "dim sun": {"light": {"least_lux": SHADE * SUNNY_LUX, "most_lux": SHADE * SUNNY_LUX}},
+}
+"""Each takes one of the two things away that go together in rooms with shadows: shading by the sun, or its light."""
 
 AGES = (BLIND, DEPTH, "depth-late-1", "depth-late-2", "events", *FRAMES[:2])
 CLOCK = "@"
@@ -143,7 +148,7 @@ AXES: dict[str, Axis] = {
         ("medium", "rooms"),
         {name: ("--camera.shadows",) if cast else () for name, cast in SHADOWS.items()},
         REAL,
-        {name: {"camera": {"shadows": cast}} for name, cast in SHADOWS.items()},
+        {name: {"camera": {"shadows": cast}} for name, cast in SHADOWS.items()} | IN_LIGHT,
         (
             *("--surface.pattern", "plaid", "--camera.ambient", str(SHADE)),
             *("--light.least-lux", str(SUNNY_LUX), "--light.most-lux", str(SUNNY_LUX)),

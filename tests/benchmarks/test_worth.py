@@ -98,7 +98,9 @@ def test_shade_is_trained_and_flown_without_and_with_cast_shadows() -> None:
     assert [config.camera.shadows for config in configs] == [False, True]
     assert {(config.camera.ambient, config.surface.pattern) for config in configs} == {(0.01, "plaid")}
     assert all(config.exposure.real and config.light.least_lux == 10_000 for config in configs)
-    assert [layer["camera"]["shadows"] for layer in flown_of(axis, "events").values()] == [False, True]
+    flown = flown_of(axis, "events")
+    assert [flown[name]["camera"]["shadows"] for name in axis.trained] == [False, True]
+    assert flown["no shading"]["camera"]["ambient"] == 1 and flown["dim sun"]["light"]["most_lux"] == 100
     places = places_of(axis, ["medium"], list(axis.trained), list(axis.sensors))
     assert (
         len(places) == 2 + 3 * 2 and len(flown_of(axis, "depth")) == 1
