@@ -68,6 +68,7 @@ FN void share_frame(const Batch* b, uint32_t m, Frame* f) {
 /* The upright shapes of a pass that a strip may show, in their order. */
 typedef struct {
   unsigned bits[THREADS / 32]; /* by thread, a shape each */
+  float closest[THREADS];      /* likewise, before a camera on the body */
   int list[THREADS];
 } Gathered;
 
@@ -91,7 +92,8 @@ FN int gather(Gathered* g, int n, int shown) {
 FN int column_of(int t) { return t % 8 + t / 32 % (COLUMNS / 8) * 8; }
 FN int row_of(int t) { return t / 8 % 4 + t / 128 * 4; }
 
-/* Where numbers of a shape are, of each column that it covers: arrays of `columns`, from column `first` of the strip on. */
+/* Where the numbers of a shape are: those of each column that it covers one after the other, from column `first` of the
+ * strip on. */
 typedef struct {
   int begins, first, columns;
 } Place;
@@ -115,20 +117,15 @@ FN int next_of(int rest, int many) {
   return rest < most ? rest : most;
 }
 
-/* Gives a shape that covers the columns [first, last) of the image its place, `arrays` of them, and returns whether there
- * is room; `used` floats are taken. */
-FN int reserve(Book* book, int which, int first, int last, int left, int arrays, int room, int* used) {
+/* Gives a shape that covers the columns [first, last) of the image its place, `numbers` for each, and returns whether
+ * there is room; `used` floats are taken. */
+FN int reserve(Book* book, int which, int first, int last, int left, int numbers, int room, int* used) {
   const int from = first > left ? first - left : 0, to = last < left + COLUMNS ? last - left : COLUMNS;
   const Place place = {*used, from, to - from};
-  if (*used + arrays * place.columns > room) return 0;
+  if (*used + numbers * place.columns > room) return 0;
   if (threadIdx.x == which) book->places[which] = place;
-  *used += arrays * place.columns;
+  *used += numbers * place.columns;
   return 1;
-}
-
-/* Returns where the numbers of a shape begin in column `x` of the strip; -1 where it covers none. */
-FN int begin_in(const Place* p, int x) {
-  return x < p->first || x >= p->first + p->columns ? -1 : p->begins + x - p->first;
 }
 
 /* The upright shapes before a level camera. */
@@ -154,11 +151,11 @@ FN int set_up(const Frame* f, const int* list, int k, int found, int left, Level
       ++fit;
     __syncthreads();
     for (int task = t; task < fit * COLUMNS; task += THREADS) {
-      const int which = many + task / COLUMNS, x = task % COLUMNS, begins = begin_in(&to->book.places[which], x);
-      if (begins < 0) continue;
-      const int stride = to->book.places[which].columns;
-      sides(c, &f->eye, &to->staged[task / COLUMNS], c->u[left + x], to->numbers + begins, stride);
-      if (to->numbers[begins + SHARE * stride] > 0) atomicOr(&to->book.covering[which / 32][x], 1u << which % 32);
+      const int which = many + task / COLUMNS, x = task % COLUMNS, at = x - to->book.places[which].first;
+      if (at < 0 || at >= to->book.places[which].columns) continue;
+      float* of = to->numbers + to->book.places[which].begins + NUMBERS * at;
+      sides(c, &f->eye, &to->staged[task / COLUMNS], c->u[left + x], of, 1);
+      if (of[SHARE] > 0) atomicOr(&to->book.covering[which / 32][x], 1u << which % 32);
     }
     __syncthreads();
     many += fit, full = fit < staged || many == KEPT;
@@ -207,7 +204,7 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
           for (int word = 0; word < (many + 31) / 32; ++word)
             for (unsigned left_over = shapes.book.covering[word][across]; left_over; left_over &= left_over - 1) {
               const Place* at = &shapes.book.places[32 * word + __ffs((int)left_over) - 1];
-              insert_side(c, shapes.numbers + begin_in(at, across), at->columns, row, &layers);
+              insert_side(c, shapes.numbers + at->begins + NUMBERS * (across - at->first), 1, row, &layers);
             }
       }
     }
@@ -273,16 +270,26 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) measure(const Batch 
   }
 }
 
-/* Lists the upright shapes from `base` on, at most one a thread, that a camera on the body may show between two columns;
- * returns how many they are. Every thread of the block calls it. */
+/* Lists the upright shapes from `base` on, at most one a thread, that a camera on the body may show between two columns,
+ * those first that may be closest, since they hide others; returns how many they are. Every thread of the block calls it. */
 FN int gather_tilted(const Frame* f, const Bounds* bounds, int base, int left, int right, Gathered* gathered) {
   Tilted shape;
-  const int n = base + threadIdx.x;
+  const int t = threadIdx.x, n = base + t;
   const int shown = n < f->shapes.boxes + f->shapes.cylinders &&
                     tilted_shape(&f->camera, &f->shapes, &f->eye, bounds, n, &shape) && shape.first < right &&
                     shape.last > left;
+  const float closest = shown ? shape.seen.closest : -1;
   __syncthreads(); /* nobody is at the list of the pass before */
-  return gather(gathered, n, shown);
+  gathered->closest[t] = closest;
+  const int found = __syncthreads_count(shown);
+  int before = 0;
+  for (int other = 0; other < THREADS; ++other) {
+    const float at = gathered->closest[other];
+    before += at > closest || (at == closest && other < t);
+  }
+  if (shown) gathered->list[before] = n;
+  __syncthreads();
+  return found;
 }
 
 /* The upright shapes before a camera on the body. */
@@ -307,18 +314,18 @@ FN int set_up_tilted(const Frame* f, const Bounds* bounds, const int* list, int 
     int fit = 0;
     for (; fit < staged; ++fit) {
       const Tilted* p = &to->staged[fit];
-      const int arrays = HEIGHTS(p->seen.is_box, c->across);
-      if (!reserve(&to->book, many + fit, p->first, p->last, left, arrays, TILTED_ROOM, &used)) break;
+      const int numbers = HEIGHTS(p->seen.is_box, c->across);
+      if (!reserve(&to->book, many + fit, p->first, p->last, left, numbers, TILTED_ROOM, &used)) break;
       if (t == fit) to->shapes[many + fit] = p->seen;
     }
     __syncthreads();
     for (int task = t; task < fit * COLUMNS; task += THREADS) {
-      const int which = many + task / COLUMNS, x = task % COLUMNS, begins = begin_in(&to->book.places[which], x);
-      if (begins < 0) continue;
-      const int stride = to->book.places[which].columns;
-      float* of = to->heights + begins;
-      write_heights(c, &to->staged[task / COLUMNS], c->u[left + x], of, stride);
-      if (of[0] < of[stride]) atomicOr(&to->book.covering[which / 32][x], 1u << which % 32);
+      const int which = many + task / COLUMNS, x = task % COLUMNS, at = x - to->book.places[which].first;
+      if (at < 0 || at >= to->book.places[which].columns) continue;
+      const Tilted* p = &to->staged[task / COLUMNS];
+      float* of = to->heights + to->book.places[which].begins + HEIGHTS(p->seen.is_box, c->across) * at;
+      write_heights(c, p, c->u[left + x], of, 1);
+      if (of[0] < of[1]) atomicOr(&to->book.covering[which / 32][x], 1u << which % 32);
     }
     __syncthreads();
     many += fit, full = fit < staged || many == KEPT;
@@ -365,10 +372,10 @@ static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(c
           for (int word = 0; word < (many + 31) / 32; ++word)
             for (unsigned left_over = shapes.book.covering[word][across]; left_over; left_over &= left_over - 1) {
               const int which = 32 * word + __ffs((int)left_over) - 1;
+              const Seen* p = &shapes.shapes[which];
               const Place* at = &shapes.book.places[which];
-              const float* of = shapes.heights + begin_in(at, across);
-              if (v >= of[0] && v <= of[at->columns])
-                insert_rows(c, &shapes.shapes[which], u, v, of, at->columns, &layers);
+              const float* of = shapes.heights + at->begins + HEIGHTS(p->is_box, c->across) * (across - at->first);
+              if (v >= of[0] && v <= of[1]) insert_rows(c, p, u, v, of, 1, &layers);
             }
       }
     }
