@@ -87,7 +87,6 @@ typedef struct {
   Caster* casters;
   Tilted* tilted;
   float* heights; /* of the tilted ones' faces */
-  int* order;     /* of the tilted ones */
   int *covering, *found; /* shapes that cover each column, in order, and how many */
   int stride, most;
   Fields fields;
@@ -106,12 +105,11 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + s->fields + 1));
   w->casters = malloc(sizeof(Caster) * (size_t)(uprights + s->spheres + 1));
   w->tilted = malloc(sizeof(Tilted) * (size_t)(uprights + 1));
-  w->order = malloc(sizeof(int) * (size_t)(uprights + 1));
   w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)(uprights * HEIGHTS(1, c->across) * w->stride) + 1 : 1));
   w->most = uprights + 1;
   w->found = malloc(sizeof(int) * (size_t)c->width * (size_t)(w->most + 1));
   if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres) return 0;
-  if (!w->patterns || !w->casters || !w->tilted || !w->heights || !w->order) return 0;
+  if (!w->patterns || !w->casters || !w->tilted || !w->heights) return 0;
   if (!prepare_fields(c, rows, s->fields, &w->fields)) return 0;
   w->covering = w->found + c->width;
   w->v = w->u + w->stride, w->nearest = w->v + rows;
@@ -123,7 +121,7 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
 
 static void release(Work* w) {
   free(w->numbers), free(w->sides), free(w->layers), free(w->u), free(w->found), free(w->spheres);
-  free(w->patterns), free(w->casters), free(w->tilted), free(w->order), free(w->heights), free(w->fields.ray[0]);
+  free(w->patterns), free(w->casters), free(w->tilted), free(w->heights), free(w->fields.ray[0]);
 }
 
 /* Writes a column of blended layers. */
@@ -136,27 +134,6 @@ static void finish(const Camera* c, const Shapes* s, const Plane* planes, const 
   }
 }
 
-/* Puts tilted shape `n` among those before it: the ones that may be closest come first, since they hide others. */
-static void line_up(Work* w, int n) {
-  int at = n;
-  for (; at && w->tilted[w->order[at - 1]].seen.closest < w->tilted[n].seen.closest; --at)
-    w->order[at] = w->order[at - 1];
-  w->order[at] = n;
-}
-
-/* Lists for each column the tilted shapes, `visible` of them, that cover it; heights of each are `of_shape` apart. */
-static void cover_columns(const Camera* c, Work* w, int visible, int of_shape) {
-  memset(w->found, 0, sizeof(int) * (size_t)c->width);
-  for (int k = 0; k < visible; ++k) {
-    const Tilted* p = &w->tilted[w->order[k]];
-    const float* heights = w->heights + (size_t)w->order[k] * of_shape;
-    for (int column = p->first; column < p->last; ++column) {
-      w->covering[column * w->most + w->found[column]] = w->order[k];
-      w->found[column] += heights[column] < heights[w->stride + column];
-    }
-  }
-}
-
 /* Draws one frame of a camera that is fixed to the body, [H, C]. */
 static void draw_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w, const Wave* waves,
                         const Plane* planes, float* picture) {
@@ -164,15 +141,19 @@ static void draw_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w,
   Bounds bounds;
   bounds_of(c, e, &bounds);
   int visible = 0;
+  memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     Tilted* p = &w->tilted[visible];
     if (!tilted_shape(c, s, e, &bounds, n, p)) continue;
     float* heights = w->heights + (size_t)visible * of_shape;
     for (int first = p->first / LANES * LANES; first < p->last; first += LANES)
       write_heights(c, p, load(w->u + first), heights + first, w->stride);
-    line_up(w, visible++);
+    for (int column = p->first; column < p->last; ++column) {
+      w->covering[column * w->most + w->found[column]] = visible;
+      w->found[column] += heights[column] < heights[w->stride + column];
+    }
+    ++visible;
   }
-  cover_columns(c, w, visible, of_shape);
   for (int n = 0; n < s->spheres; ++n) w->spheres[n] = extent_of_sphere(c, s, e, n);
   for (int column = 0; column < c->width; ++column) {
     float ahead[3];
@@ -256,6 +237,7 @@ static void measure_tilted(const Camera* c, const Shapes* s, const Eye* e, Work*
   Bounds bounds;
   bounds_of(c, e, &bounds);
   int visible = 0;
+  memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     Tilted* p = &w->tilted[visible];
     if (!tilted_shape(c, s, e, &bounds, n, p)) continue;
@@ -265,9 +247,12 @@ static void measure_tilted(const Camera* c, const Shapes* s, const Eye* e, Work*
       heights_of_shape(p, load(w->u + first), &low, &high);
       store(heights + first, low - c->pitch), store(heights + w->stride + first, high + c->pitch);
     }
-    line_up(w, visible++);
+    for (int column = p->first; column < p->last; ++column) {
+      w->covering[column * w->most + w->found[column]] = visible;
+      w->found[column] += heights[column] < heights[w->stride + column];
+    }
+    ++visible;
   }
-  cover_columns(c, w, visible, 2 * w->stride);
   for (int column = 0; column < c->width; ++column) {
     float ahead[3], *nearest = w->nearest;
     ray_ahead(e, c->u[column], ahead);
@@ -282,7 +267,6 @@ static void measure_tilted(const Camera* c, const Shapes* s, const Eye* e, Work*
       for (int row = 0; row < c->height; row += LANES) {
         const int last = row + LANES < c->height ? row + LANES - 1 : c->height - 1;
         if (w->v[row] < heights[0] || w->v[last] > heights[w->stride]) continue;
-        if (!any_of(load(nearest + row) * p->seen.closest > 1)) continue;
         store(nearest + row, nearer_tilted(s, e, p, ahead, load(w->v + row), load(nearest + row)));
       }
     }

@@ -68,7 +68,6 @@ FN void share_frame(const Batch* b, uint32_t m, Frame* f) {
 /* The upright shapes of a pass that a strip may show, in their order. */
 typedef struct {
   unsigned bits[THREADS / 32]; /* by thread, a shape each */
-  float closest[THREADS];      /* likewise, before a camera on the body */
   int list[THREADS];
 } Gathered;
 
@@ -270,26 +269,16 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) measure(const Batch 
   }
 }
 
-/* Lists the upright shapes from `base` on, at most one a thread, that a camera on the body may show between two columns,
- * those first that may be closest, since they hide others; returns how many they are. Every thread of the block calls it. */
+/* Lists the upright shapes from `base` on, at most one a thread, that a camera on the body may show between two columns;
+ * returns how many they are. Every thread of the block calls it. */
 FN int gather_tilted(const Frame* f, const Bounds* bounds, int base, int left, int right, Gathered* gathered) {
   Tilted shape;
-  const int t = threadIdx.x, n = base + t;
+  const int n = base + threadIdx.x;
   const int shown = n < f->shapes.boxes + f->shapes.cylinders &&
                     tilted_shape(&f->camera, &f->shapes, &f->eye, bounds, n, &shape) && shape.first < right &&
                     shape.last > left;
-  const float closest = shown ? shape.seen.closest : -1;
   __syncthreads(); /* nobody is at the list of the pass before */
-  gathered->closest[t] = closest;
-  const int found = __syncthreads_count(shown);
-  int before = 0;
-  for (int other = 0; other < THREADS; ++other) {
-    const float at = gathered->closest[other];
-    before += at > closest || (at == closest && other < t);
-  }
-  if (shown) gathered->list[before] = n;
-  __syncthreads();
-  return found;
+  return gather(gathered, n, shown);
 }
 
 /* The upright shapes before a camera on the body. */

@@ -29,7 +29,6 @@ typedef struct {
   int is_box, number, faces;                          /* of all; how many are seen */
   float origin[3], forward[3], right[3], up[3];       /* in its own frame: the eye from its middle; the image's axes */
   float radius, half_height, value, sun[2], end_bright; /* of a cylinder */
-  float closest;                                      /* nothing of it is closer */
   Front front[3];                                     /* of a box, whose far faces the eye does not see */
 } Seen;
 
@@ -160,15 +159,11 @@ FN void bounds_of(const Camera* c, const Eye* e, Bounds* b) {
     b->flat[k] = sqrtf(b->normal[k][0] * b->normal[k][0] + b->normal[k][1] * b->normal[k][1]);
 }
 
-/* How far an upright cylinder reaches from its middle in the direction of a bound's normal, times its length. */
-FN float reach_of(const Bounds* b, int k, float radius, float half) {
-  return (radius * 1.0001f + 1e-3f) * b->flat[k] + (half * 1.0001f + 1e-3f) * fabsf(b->normal[k][2]);
-}
-
 /* Whether no part of an upright cylinder, its middle `to` [3] from the eye, can be in the image. */
 FN int out_of_bounds(const Bounds* b, const float* to, float radius, float half) {
+  const float r = radius * 1.0001f + 1e-3f, h = half * 1.0001f + 1e-3f;
   int out = 0;
-  for (int k = 0; k < 5; ++k) out |= dot3(b->normal[k], to) > reach_of(b, k, radius, half);
+  for (int k = 0; k < 5; ++k) out |= dot3(b->normal[k], to) > r * b->flat[k] + h * fabsf(b->normal[k][2]);
   return out;
 }
 
@@ -196,7 +191,6 @@ FN INLINED int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, cons
   const float radius = is_box ? sqrtf(half[0] * half[0] + half[1] * half[1]) : s->cylinder_radius[i];
   const float tall = is_box ? half[2] : s->cylinder_half[i];
   if (out_of_bounds(bounds, to, radius, tall)) return 0;
-  const float in_front = dot3(to, e->forward) - reach_of(bounds, 0, radius, tall);
   const float flat = sqrtf(away[0] * away[0] + away[1] * away[1]);
   const int on_axis = flat < TINY; /* of a cylinder, whose frame faces the eye: then any does */
   const float cos = is_box ? cosf(s->box_yaw[i]) : on_axis ? 1 : away[0] / flat;
@@ -204,7 +198,6 @@ FN INLINED int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, cons
   const float axes[3][3] = {{cos, sin, 0}, {-sin, cos, 0}, {0, 0, 1}};
   Seen* q = &p->seen;
   q->is_box = is_box, q->number = n, q->radius = radius, q->half_height = tall;
-  q->closest = in_front > CUT_M ? 1 / in_front : NOWHERE;
   for (int k = 0; k < 3; ++k) {
     q->origin[k] = dot3(axes[k], away), q->forward[k] = dot3(axes[k], e->forward);
     q->right[k] = dot3(axes[k], e->right), q->up[k] = dot3(axes[k], e->up);
@@ -317,19 +310,9 @@ FN Extent extent_of_sphere(const Camera* c, const Shapes* s, const Eye* e, int n
   return found;
 }
 
-/* Whether in each of LANES rows a layer covers all that may be seen of a shape. */
-FN int is_hidden(const Seen* p, const Layers* layers) {
-  if (!layers->inserted) return 0;
-  const Layer* l = layers->layer;
-  Mask open = (l->coverage < WHOLE) | (l->closeness < p->closest);
-  for (int k = 1; k < DEPTH_OF_LAYERS; ++k) open &= (l[k].coverage < WHOLE) | (l[k].closeness < p->closest);
-  return !any_of(open);
-}
-
 /* Adds what LANES rows at `high` of a column at `u` show of a shape, which `write_heights` wrote `heights` of. */
 FN void insert_rows(const Camera* c, const Seen* p, float u, Lanes high, const float* heights, int stride,
                     Layers* layers) {
-  if (is_hidden(p, layers)) return;
   if (p->is_box)
     insert_box(c, p, u, high, heights + 2 * stride, stride, layers);
   else
