@@ -204,7 +204,7 @@ class TrainConfig:
     """Devices to use; 0 uses the largest number that divides the shards."""
     products: Literal["auto", "float32", "bfloat16"] = "auto"
     """Factors of the products in updates of encoder and Q-network: rounded to bfloat16 or not; sums are in float32.
-    auto is bfloat16 on CPUs with AMX, where that is faster, else float32."""
+    auto is bfloat16 on CPUs where that is faster (with AMX, or AMD's from Zen 4 on), else float32."""
     seed: Annotated[int, NOT_NEGATIVE, less_than(2**32, "2**32")] = 0
     """Random seed of the run."""
     validation_every: Annotated[int, NOT_NEGATIVE] = 98_304

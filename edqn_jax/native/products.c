@@ -1,5 +1,5 @@
-/* Products of matrices in bfloat16 with sums in float32, for CPUs with AMX: handlers of XLA's foreign function
- * interface (`products.py` registers them).
+/* Products of matrices in bfloat16 with sums in float32, for CPUs with AMX, or without it by AVX-512's dot products of
+ * pairs: handlers of XLA's foreign function interface (`products.py` registers them).
  *
  * Factors come in float32 and are rounded to the nearest bfloat16, ties to even. Both are packed in tiles of 1 KB, as
  * AMX wants them: of the left factor 16 rows of 32 numbers, of the right one 16 columns of 32 numbers in pairs.
@@ -34,16 +34,21 @@ typedef struct {
   int along_first; /* whether memory is [along, across], row by row, or [across, along] */
 } Factor;
 
+/* Whether the processor has AMX for bfloat16, and the system gives this process its registers. */
+static int has_amx(void) {
+  unsigned a, b, c, d;
+  if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(d >> 22 & 1) || !(d >> 24 & 1)) return 0;
+  /* Linux gives a process the tiles' registers when it asks for them: ARCH_REQ_XCOMP_PERM, XTILEDATA. */
+  return syscall(SYS_arch_prctl, 0x1023, 18) == 0;
+}
+
 /* Returns why tiles cannot be multiplied here; NULL if they can. */
 static const char* find_fault(void) {
   unsigned a, b, c, d;
-  const char* const missing = "this processor has no AMX for bfloat16";
-  if (!__builtin_cpu_supports("avx512bw") || !__builtin_cpu_supports("avx512vl") || !__builtin_cpu_supports("avx512dq"))
-    return missing;
-  if (!__get_cpuid_count(7, 1, &a, &b, &c, &d) || !(a >> 5 & 1)) return missing;
-  if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(d >> 22 & 1) || !(d >> 24 & 1)) return missing;
-  /* Linux gives a process the tiles' registers when it asks for them: ARCH_REQ_XCOMP_PERM, XTILEDATA. */
-  return syscall(SYS_arch_prctl, 0x1023, 18) == 0 ? 0 : "the system does not give this process AMX";
+  if (__builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq") &&
+      __get_cpuid_count(7, 1, &a, &b, &c, &d) && (a >> 5 & 1))
+    return 0;
+  return "this processor has no bfloat16 in AVX-512";
 }
 
 /* Transposes 16 rows of 16 numbers of 32 bits. */
@@ -123,9 +128,18 @@ typedef struct {
   uint8_t rows[16];
 } __attribute__((packed)) Layout;
 
-/* Multiplies two tiles of rows by two of columns, `depth` tiles deep. */
-WITH_AMX static inline void multiply_tiles(float* found, const uint16_t* left, const uint16_t* right, int64_t depth,
-                                         int64_t left_step, int64_t right_step) {
+/* Kept in memory: GCC does not know that the instruction reads more than its first bytes. */
+static const Layout layout = {.palette = 1,
+                              .bytes = {64, 64, 64, 64, 64, 64, 64, 64},
+                              .rows = {16, 16, 16, 16, 16, 16, 16, 16}};
+
+/* Multiplies two tiles of rows by two of columns, `depth` tiles deep; steps are from one tile to the other, `left_step`
+ * 0 where there is but one of rows. */
+typedef void Multiply(float* found, const uint16_t* left, const uint16_t* right, int64_t depth, int64_t left_step,
+                      int64_t right_step);
+
+WITH_AMX static void multiply_by_amx(float* found, const uint16_t* left, const uint16_t* right, int64_t depth,
+                                     int64_t left_step, int64_t right_step) {
   _tile_zero(0);
   _tile_zero(1);
   _tile_zero(2);
@@ -146,18 +160,36 @@ WITH_AMX static inline void multiply_tiles(float* found, const uint16_t* left, c
   _tile_stored(3, found + 768, 64);
 }
 
-/* Kept in memory: GCC does not know that the instruction reads more than its first bytes. */
-static const Layout layout = {.palette = 1,
-                              .bytes = {64, 64, 64, 64, 64, 64, 64, 64},
-                              .rows = {16, 16, 16, 16, 16, 16, 16, 16}};
+#define AT_ONCE 8 /* rows, whose sums fill half of the registers */
+
+WITH_AVX512 static void multiply_by_dots(float* found, const uint16_t* left, const uint16_t* right, int64_t depth,
+                                         int64_t left_step, int64_t right_step) {
+  for (int first = 0; first < (left_step ? 2 * ROWS : ROWS); first += AT_ONCE) {
+    const uint16_t* rows = left + first / ROWS * left_step + first % ROWS * DEPTH;
+    __m512 sums[AT_ONCE][2];
+    for (int i = 0; i < AT_ONCE; ++i) sums[i][0] = sums[i][1] = _mm512_setzero_ps();
+    for (int64_t k = 0; k < depth; ++k)
+      for (int p = 0; p < DEPTH / 2; ++p) {
+        const uint16_t* of = right + k * TILE + p * DEPTH;
+        const __m512bh one = (__m512bh)_mm512_load_si512(of), other = (__m512bh)_mm512_load_si512(of + right_step);
+        for (int i = 0; i < AT_ONCE; ++i) {
+          int32_t pair;
+          memcpy(&pair, rows + k * TILE + i * DEPTH + 2 * p, sizeof pair);
+          const __m512bh row = (__m512bh)_mm512_set1_epi32(pair);
+          sums[i][0] = _mm512_dpbf16_ps(sums[i][0], row, one), sums[i][1] = _mm512_dpbf16_ps(sums[i][1], row, other);
+        }
+      }
+    float* to = found + first / ROWS * 512 + first % ROWS * 16;
+    for (int i = 0; i < AT_ONCE; ++i) _mm512_store_ps(to + 16 * i, sums[i][0]), _mm512_store_ps(to + 256 + 16 * i, sums[i][1]);
+  }
+}
 
 /* Writes left times right to `to` [left.across, right.across]. */
-WITH_AMX static void multiply(const Factor* left, const Factor* right, float* to, uint16_t* scratch) {
+WITH_AVX512 static void multiply(const Factor* left, const Factor* right, float* to, uint16_t* scratch, Multiply* tiles) {
   const int64_t columns = (right->across + ROWS - 1) / ROWS, pairs = (columns + 1) / 2;
   uint16_t* const rows = scratch; /* of two tiles of rows, then all of the right factor's */
   uint16_t* const packed = scratch + 2 * BLOCK / DEPTH * TILE;
   float found[1024] __attribute__((aligned(64)));
-  _tile_loadconfig(&layout);
   for (int64_t from = 0; from < left->along; from += BLOCK) {
     const int64_t end = left->along < from + BLOCK ? left->along : from + BLOCK;
     const int64_t depth = (end - from + DEPTH - 1) / DEPTH;
@@ -173,7 +205,7 @@ WITH_AMX static void multiply(const Factor* left, const Factor* right, float* to
       }
       for (int64_t j = 0; j < pairs; ++j) {
         const uint16_t* pair = packed + 2 * j * depth * TILE;
-        multiply_tiles(found, rows, pair, depth, second ? depth * TILE : 0, depth * TILE);
+        tiles(found, rows, pair, depth, second ? depth * TILE : 0, depth * TILE);
         for (int t = 0; t < 4; ++t) {
           const int64_t down = i + (t >> 1) * ROWS, across = (2 * j + (t & 1)) * ROWS;
           if (down < left->across && across < right->across)
@@ -183,8 +215,26 @@ WITH_AMX static void multiply(const Factor* left, const Factor* right, float* to
       }
     }
   }
+}
+
+/* Multiplies `many` pairs of factors that stand one after the other. */
+WITH_AVX512 static void multiply_each(Factor left, Factor right, float* to, int64_t many, uint16_t* scratch,
+                                      Multiply* tiles) {
+  for (int64_t i = 0; i < many; ++i) {
+    multiply(&left, &right, to, scratch, tiles);
+    left.data += left.across * left.along;
+    right.data += right.across * right.along;
+    to += left.across * right.across;
+  }
+}
+
+WITH_AMX static void multiply_each_by_amx(Factor left, Factor right, float* to, int64_t many, uint16_t* scratch) {
+  _tile_loadconfig(&layout);
+  multiply_each(left, right, to, many, scratch, multiply_by_amx);
   _tile_release();
 }
+
+static int by_amx; /* set before the first product */
 
 /* Returns room that this thread keeps, of at least so many bytes; NULL if there is none. */
 static uint16_t* scratch_of(size_t bytes) {
@@ -203,17 +253,17 @@ static int multiply_all(const Factor* left, const Factor* right, float* to, int6
   const int64_t columns = (right->across + 2 * ROWS - 1) / (2 * ROWS) * 2;
   uint16_t* scratch = scratch_of((size_t)((2 + columns) * (BLOCK / DEPTH) * TILE) * sizeof(uint16_t));
   if (!scratch) return 0;
-  Factor first = *left, second = *right;
-  for (int64_t i = 0; i < many; ++i) {
-    multiply(&first, &second, to, scratch);
-    first.data += first.across * first.along;
-    second.data += second.across * second.along;
-    to += first.across * second.across;
-  }
+  if (by_amx)
+    multiply_each_by_amx(*left, *right, to, many, scratch);
+  else
+    multiply_each(*left, *right, to, many, scratch, multiply_by_dots);
   return 1;
 }
 
-const char* edqn_unusable_products(void) { return find_fault(); }
+const char* edqn_unusable_products(void) {
+  by_amx = has_amx();
+  return find_fault();
+}
 
 /* Returns a factor [..., along, across] or [..., across, along]. */
 static Factor factor_of(const XLA_FFI_Buffer* buffer, int along_first) {

@@ -1,4 +1,4 @@
-"""Products in bfloat16: by AMX where the processor has it, else by XLA, against rounded factors in double precision."""
+"""Products in bfloat16, in C where that is faster, else by XLA, against rounded factors in double precision."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from edqn_jax.config import AgentConfig
 from edqn_jax.learn.perception.layers import matmul
 from edqn_jax.learn.qnetwork import init_q, q_values
-from edqn_jax.native.products import LEAST_SIDE, are_rounded, in_precision, is_available, rounded_matmul
+from edqn_jax.native.products import LEAST_SIDE, are_rounded, in_precision, is_available, is_faster_on, rounded_matmul
 from edqn_jax.native.shipped import processor_flags
 from tests.oracles.rounded_products import product, to_bfloat16
 
@@ -65,8 +65,22 @@ def test_numbers_of_other_types_are_multiplied_as_they_are(dtype: Any) -> None:
     np.testing.assert_array_equal(np.asarray(rounded_matmul(x, x), np.float32), np.full((32, 32), 32.0))
 
 
-def test_where_the_processor_has_amx_and_there_is_a_compiler_it_is_used() -> None:
-    has = {"amx_bf16", "amx_tile", "avx512_bf16"} <= processor_flags() and shutil.which("cc") is not None
+@pytest.mark.parametrize(
+    ("flags", "faster"),
+    [
+        ("avx512f avx512_bf16 amx_bf16 amx_tile", True),  # a Xeon from 2023 on
+        ("avx512f avx512_bf16 sse4a", True),  # Zen 4
+        ("avx512f avx512_bf16", False),  # Cooper Lake, or a Xeon whose host keeps AMX back
+        ("avx512f sse4a", False),
+        ("avx2 amx_bf16 amx_tile", False),
+    ],
+)
+def test_bfloat16_is_taken_where_it_is_faster(flags: str, faster: bool) -> None:
+    assert is_faster_on(frozenset(flags.split())) is faster
+
+
+def test_where_it_is_faster_and_there_is_a_compiler_it_is_in_c() -> None:
+    has = is_faster_on(processor_flags()) and shutil.which("cc") is not None
     text = jax.jit(rounded_matmul).lower(jnp.ones((32, 32)), jnp.ones((32, 32))).as_text()
     assert ("edqn_product" in text) is is_available() is has
 
