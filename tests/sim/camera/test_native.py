@@ -215,6 +215,12 @@ def crowded_forest(rng: np.random.Generator) -> Scene:
     )
 
 
+def wide_boxes(rng: np.random.Generator) -> Scene:
+    """Shapes that cover so many columns that a block has no room for all of them at once."""
+    places, halves = rng.uniform([0, 0, 0], [60, 60, 8], (100, 3)), rng.uniform([4, 4, 0.2], [9, 9, 0.6], (100, 3))
+    return scene_of(GROUND, *(box(*place, *half, rng.uniform(0, 3)) for place, half in zip(places, halves, strict=True)))
+
+
 def empty_field(rng: np.random.Generator) -> Scene:
     """Ground and a ball: no upright shape."""
     return scene_of(GROUND, ball(30, 30, 3, rng.uniform(8, 12)))
@@ -227,6 +233,7 @@ def empty_field(rng: np.random.Generator) -> Scene:
         pytest.param((13, 7), crowd, id="no multiple of a block", marks=pytest.mark.whole),
         pytest.param((70, 20), crowd, id="several blocks", marks=pytest.mark.whole),
         pytest.param((32, 24), crowded_forest, id="several passes", marks=pytest.mark.whole),
+        pytest.param((32, 24), wide_boxes, id="no room for all", marks=pytest.mark.whole),
         pytest.param((32, 24), empty_field, id="no upright shapes"),
     ],
 )
@@ -251,9 +258,14 @@ def test_the_kernels_of_gpus_draw_what_jax_draws(
         ((13, 7), crowd, 3, True),
         ((70, 20), crowd, 5, True),
         ((32, 24), crowded_forest, 3, False),
+        ((32, 24), wide_boxes, 3, False),
+        ((32, 24), wide_boxes, 16, False),
         ((32, 24), empty_field, 16, False),
     ],
-    ids=["usual", "no multiple of a block", "several blocks", "several passes", "no upright shapes"],
+    ids=[
+        *("usual", "no multiple of a block", "several blocks", "several passes", "no room for all"),
+        *("room for few", "no upright shapes"),
+    ],
 )
 def test_the_kernels_of_gpus_draw_what_c_draws_of_a_camera_on_the_body(
     kernels: bool,
