@@ -43,8 +43,8 @@ SUNNY_LUX, SHADE = 10_000.0, 0.01
 SHADOWS = {"no shadows": False, "shadows": True}
 """By condition: `camera.shadows`."""
 IN_LIGHT = {
-    "no shading": {"camera": {"ambient": 1.0}},
-    "dim sun": {"light": {"least_lux": SHADE * SUNNY_LUX, "most_lux": SHADE * SUNNY_LUX}},
+    "no shading": {"camera": {"shadows": False, "ambient": 1.0}},
+    "dim sun": {"camera": {"shadows": False}, "light": {"least_lux": SHADE * SUNNY_LUX, "most_lux": SHADE * SUNNY_LUX}},
 }
 """Each takes one of the two things away that go together in rooms with shadows: shading by the sun, or its light."""
 

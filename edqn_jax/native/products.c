@@ -24,6 +24,14 @@
 #define DEPTH 32   /* of both: the sum runs over these */
 #define BLOCK 1024 /* numbers that are summed before the next are packed, a multiple of DEPTH */
 
+#ifdef WITHOUT_AMX /* a test of what AMD's processors take, on any */
+#define USES_AMX 0
+#define USES_DOTS 1
+#else
+#define USES_AMX 1
+#define USES_DOTS __builtin_cpu_supports("sse4a")
+#endif
+
 #define WITH_AVX512 __attribute__((target("avx512f,avx512bw,avx512vl,avx512dq,avx512bf16")))
 #define WITH_AMX __attribute__((target("avx512f,avx512bw,avx512vl,avx512dq,avx512bf16,amx-tile,amx-bf16")))
 
@@ -37,18 +45,21 @@ typedef struct {
 /* Whether the processor has AMX for bfloat16, and the system gives this process its registers. */
 static int has_amx(void) {
   unsigned a, b, c, d;
+  if (!USES_AMX) return 0;
   if (!__get_cpuid_count(7, 0, &a, &b, &c, &d) || !(d >> 22 & 1) || !(d >> 24 & 1)) return 0;
   /* Linux gives a process the tiles' registers when it asks for them: ARCH_REQ_XCOMP_PERM, XTILEDATA. */
   return syscall(SYS_arch_prctl, 0x1023, 18) == 0;
 }
 
-/* Returns why tiles cannot be multiplied here; NULL if they can. */
+/* Returns why products are not faster here in bfloat16 than in float32; NULL if they are. Without AMX they are on AMD's
+ * processors alone, see `products.py`. */
 static const char* find_fault(void) {
   unsigned a, b, c, d;
-  if (__builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512dq") &&
-      __get_cpuid_count(7, 1, &a, &b, &c, &d) && (a >> 5 & 1))
-    return 0;
-  return "this processor has no bfloat16 in AVX-512";
+  if (!__builtin_cpu_supports("avx512bw") || !__builtin_cpu_supports("avx512vl") ||
+      !__builtin_cpu_supports("avx512dq") || !__get_cpuid_count(7, 1, &a, &b, &c, &d) || !(a >> 5 & 1))
+    return "this processor has no bfloat16 in AVX-512";
+  if (has_amx() || USES_DOTS) return 0;
+  return "the system does not give this process AMX";
 }
 
 /* Transposes 16 rows of 16 numbers of 32 bits. */
@@ -82,7 +93,7 @@ WITH_AVX512 static inline void pack(uint16_t* to, const Factor* from, int64_t ac
   const int64_t wide = from->across - across < ROWS ? from->across - across : ROWS;
   const int64_t deep = from->along - along < DEPTH ? from->along - along : DEPTH;
   const int64_t stride = from->along_first ? from->across : from->along;
-  __m512i lines[16]; /* of 16 pairs each */
+  __m512i lines[16];       /* of 16 pairs each */
   if (from->along_first) { /* a row of memory has one number of each pair: line p is of pair p, over `across` */
     const __m512i halves = _mm512_set_epi16(31, 15, 30, 14, 29, 13, 28, 12, 27, 11, 26, 10, 25, 9, 24, 8, 23, 7, 22, 6,
                                             21, 5, 20, 4, 19, 3, 18, 2, 17, 1, 16, 0);
@@ -113,7 +124,8 @@ WITH_AVX512 static inline void pack(uint16_t* to, const Factor* from, int64_t ac
 }
 
 /* Adds 16 rows of 16 numbers to what stands there, or writes them where the sum begins; `high` and `wide` are in it. */
-WITH_AVX512 static inline void store(float* to, int64_t stride, const float* found, int64_t high, int64_t wide, int begins) {
+WITH_AVX512 static inline void store(float* to, int64_t stride, const float* found, int64_t high, int64_t wide,
+                                     int begins) {
   const __mmask16 some = (__mmask16)(wide >= 16 ? 0xffffu : (1u << wide) - 1u);
   for (int i = 0; i < 16 && i < high; ++i) {
     __m512 row = _mm512_load_ps(found + 16 * i);
@@ -129,9 +141,8 @@ typedef struct {
 } __attribute__((packed)) Layout;
 
 /* Kept in memory: GCC does not know that the instruction reads more than its first bytes. */
-static const Layout layout = {.palette = 1,
-                              .bytes = {64, 64, 64, 64, 64, 64, 64, 64},
-                              .rows = {16, 16, 16, 16, 16, 16, 16, 16}};
+static const Layout layout = {
+    .palette = 1, .bytes = {64, 64, 64, 64, 64, 64, 64, 64}, .rows = {16, 16, 16, 16, 16, 16, 16, 16}};
 
 /* Multiplies two tiles of rows by two of columns, `depth` tiles deep; steps are from one tile to the other, `left_step`
  * 0 where there is but one of rows. */
@@ -180,12 +191,14 @@ WITH_AVX512 static void multiply_by_dots(float* found, const uint16_t* left, con
         }
       }
     float* to = found + first / ROWS * 512 + first % ROWS * 16;
-    for (int i = 0; i < AT_ONCE; ++i) _mm512_store_ps(to + 16 * i, sums[i][0]), _mm512_store_ps(to + 256 + 16 * i, sums[i][1]);
+    for (int i = 0; i < AT_ONCE; ++i)
+      _mm512_store_ps(to + 16 * i, sums[i][0]), _mm512_store_ps(to + 256 + 16 * i, sums[i][1]);
   }
 }
 
 /* Writes left times right to `to` [left.across, right.across]. */
-WITH_AVX512 static void multiply(const Factor* left, const Factor* right, float* to, uint16_t* scratch, Multiply* tiles) {
+WITH_AVX512 static void multiply(const Factor* left, const Factor* right, float* to, uint16_t* scratch,
+                                 Multiply* tiles) {
   const int64_t columns = (right->across + ROWS - 1) / ROWS, pairs = (columns + 1) / 2;
   uint16_t* const rows = scratch; /* of two tiles of rows, then all of the right factor's */
   uint16_t* const packed = scratch + 2 * BLOCK / DEPTH * TILE;
@@ -194,8 +207,7 @@ WITH_AVX512 static void multiply(const Factor* left, const Factor* right, float*
     const int64_t end = left->along < from + BLOCK ? left->along : from + BLOCK;
     const int64_t depth = (end - from + DEPTH - 1) / DEPTH;
     for (int64_t j = 0; j < columns; ++j)
-      for (int64_t k = 0; k < depth; ++k)
-        pack(packed + (j * depth + k) * TILE, right, j * ROWS, from + k * DEPTH, 0);
+      for (int64_t k = 0; k < depth; ++k) pack(packed + (j * depth + k) * TILE, right, j * ROWS, from + k * DEPTH, 0);
     if (columns & 1) memset(packed + columns * depth * TILE, 0, depth * TILE * sizeof(uint16_t));
     for (int64_t i = 0; i < left->across; i += 2 * ROWS) {
       const int second = i + ROWS < left->across;

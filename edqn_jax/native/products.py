@@ -1,8 +1,8 @@
 """Products of matrices in bfloat16 with sums in float32: mixed precision of the updates of training.
 
-Factors are rounded to the nearest bfloat16, ties to even; parameters, sums and optimisers stay in float32 (Micikevicius
-et al. 2018). CPUs with AMX take them by `products.c`, several times as fast as in float32, those of AMD with bfloat16 in
-AVX-512 twice as fast; elsewhere XLA multiplies the rounded factors, which is slower than not to round them.
+Factors are rounded to the nearest bfloat16, ties to even; parameters, sums and optimisers stay in float32
+(Micikevicius et al. 2018). CPUs with AMX take them by `products.c`, several times as fast as in float32, and AMD's with
+bfloat16 in AVX-512 twice as fast; elsewhere XLA multiplies the rounded factors, which is slower than not to round them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ROUNDED = contextvars.ContextVar("products are taken in bfloat16", default=Fals
 
 
 def precision_of(name: str) -> str:
-    """Returns the type of factors that `train.products` names: float32 or bfloat16, which `auto` is where that is faster."""
+    """Returns the type of factors that `train.products` names; `auto` is bfloat16 where that is faster."""
     if name == "auto":
         return "bfloat16" if is_available() else "float32"
     return name
@@ -54,16 +54,16 @@ def are_rounded() -> bool:
 
 def is_available() -> bool:
     """Returns whether this process's CPU, its default backend, multiplies by `products.c`."""
-    return jax.default_backend() == "cpu" and _has_bfloat16() and ensure_registered(SOURCE, TARGETS)
+    return jax.default_backend() == "cpu" and _is_faster() and ensure_registered(SOURCE, TARGETS)
 
 
 @functools.cache
-def _has_bfloat16() -> bool:
+def _is_faster() -> bool:
     return is_faster_on(processor_flags())
 
 
 def is_faster_on(flags: frozenset[str]) -> bool:
-    """Returns whether a processor that can do this multiplies faster in bfloat16 than in float32.
+    """Returns whether a processor with these flags multiplies faster in bfloat16 than in float32.
 
     By AMX, or by AVX-512's dot products of pairs on AMD's processors, which alone have SSE4a: on Intel's, a dot product
     takes as long as the two sums of products in float32.

@@ -15,6 +15,7 @@ import pytest
 import success
 import worth
 from edqn_jax.config import Config
+from edqn_jax.config.loading import apply_layer
 from edqn_jax.config.registry import SENSORS
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
@@ -100,7 +101,11 @@ def test_shade_is_trained_and_flown_without_and_with_cast_shadows() -> None:
     assert all(config.exposure.real and config.light.least_lux == 10_000 for config in configs)
     flown = flown_of(axis, "events")
     assert [flown[name]["camera"]["shadows"] for name in axis.trained] == [False, True]
-    assert flown["no shading"]["camera"]["ambient"] == 1 and flown["dim sun"]["light"]["most_lux"] == 100
+    trained = configs[list(axis.trained).index("shadows")]
+    alone = {name: apply_layer(trained, flown[name], name) for name in ("no shading", "dim sun")}
+    assert not any(config.camera.shadows for config in alone.values())
+    assert [config.camera.ambient for config in alone.values()] == [1.0, 0.01]
+    assert [config.light.most_lux for config in alone.values()] == [10_000, 100]
     places = places_of(axis, ["medium"], list(axis.trained), list(axis.sensors))
     assert (
         len(places) == 2 + 3 * 2 and len(flown_of(axis, "depth")) == 1

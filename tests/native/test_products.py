@@ -13,6 +13,8 @@ import pytest
 from edqn_jax.config import AgentConfig
 from edqn_jax.learn.perception.layers import matmul
 from edqn_jax.learn.qnetwork import init_q, q_values
+from edqn_jax.native import products
+from edqn_jax.native.build import ensure_registered
 from edqn_jax.native.products import LEAST_SIDE, are_rounded, in_precision, is_available, is_faster_on, rounded_matmul
 from edqn_jax.native.shipped import processor_flags
 from tests.oracles.rounded_products import product, to_bfloat16
@@ -41,6 +43,26 @@ def test_products_and_their_gradients_are_those_of_rounded_factors(rows: int, de
     assert_close(of_rows, change, kernel.T)
     assert_close(of_kernel, x.T, change)
     assert not np.allclose(found, x @ kernel, rtol=1e-5, atol=0.0)  # which rounds nothing
+
+
+@pytest.mark.parametrize(("rows", "depth", "columns"), SHAPES)
+def test_processors_without_amx_multiply_alike(
+    monkeypatch: pytest.MonkeyPatch, rows: int, depth: int, columns: int
+) -> None:
+    """By AVX-512's dot products, which a processor with AMX has as well."""
+    targets = tuple(f"dots_{target}" for target in products.TARGETS)
+    definitions = ("WITHOUT_AMX=1", *map("=".join, zip(products.TARGETS, targets, strict=True)))
+    has = shutil.which("cc") is not None and {"avx512_bf16", "avx512bw"} <= processor_flags()
+    assert ensure_registered(products.SOURCE, targets, definitions) is has
+    if has:
+        monkeypatch.setattr(products, "TARGETS", targets)
+        monkeypatch.setattr(products, "is_available", lambda: True)
+        x, kernel, change = numbers(0, rows, depth), numbers(1, depth, columns), numbers(2, rows, columns)
+        found, gradient = jax.vjp(rounded_matmul, x, kernel)
+        for each, *factors in zip(
+            (found, *gradient(change)), (x, change, x.T), (kernel, kernel.T, change), strict=True
+        ):
+            assert_close(each, *factors)
 
 
 def test_rows_in_several_dimensions_and_mapped_kernels_are_multiplied_one_by_one() -> None:

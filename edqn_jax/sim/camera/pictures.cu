@@ -2,11 +2,12 @@
  * registers them). What they are made of is in `pictures.h`; those of a camera on the body, in `tilted.h`.
  *
  * A block of threads draws a strip of COLUMNS columns of a frame, ROWS rows of it at a time, a thread a pixel. First it
- * gathers the upright shapes that the strip may show; then what its columns need of them goes into shared memory, STAGED
- * shapes at a time and for each the columns that it covers alone, from which the pixels read it. Written in C as CPUs have it too, so that a test can run
- * the kernels on one (`tests/oracles/cuda_on_cpu.h`).
+ * gathers the upright shapes that the strip may show; then what its columns need of them goes into shared memory, of
+ * each shape for the columns that it covers alone, from which the pixels read it. Written in C as CPUs have it too, so
+ * that a test can run the kernels on one (`tests/oracles/cuda_on_cpu.h`).
  */
 
+#include <assert.h>
 #include <stdint.h>
 
 #include "kernel.h"
@@ -19,10 +20,11 @@
 #define ROWS 4
 #define RESIDENT 8 /* blocks that a multiprocessor holds at once: as many as its registers allow */
 #define THREADS (COLUMNS * ROWS)
-#define STAGED 16 /* shapes that are set up at once */
-#define KEPT 64   /* and that stay, 32 a word of `covering`, as far as there is room for what columns need of them: */
-#define ROOM 5632 /* floats of a level camera, 12 for each shape and column */
-#define TILTED_ROOM 6144 /* of one on the body; a box in all columns, with 16 rays across a pixel, takes half of it */
+#define STAGED 16        /* shapes that are set up at once */
+#define KEPT 64          /* that stay, 32 a word of `covering`, as far as there is room for what their columns need */
+#define ROOM 5632        /* floats, before a level camera: 12 for each shape and column */
+#define TILTED_ROOM 6144 /* the same before a camera on the body */
+#define MOST_ACROSS 16   /* rays across a pixel: `camera.samples_across` */
 #define MEASURED_AT_ONCE 32
 #define TILTED_RESIDENT 4
 
@@ -91,6 +93,10 @@ FN int gather(Gathered* g, int n, int shown) {
 FN int column_of(int t) { return t % 8 + t / 32 % (COLUMNS / 8) * 8; }
 FN int row_of(int t) { return t / 8 % 4 + t / 128 * 4; }
 
+/* A shape in all columns finds room, else there would be no end of passes; a thread each writes where shapes are. */
+static_assert(NUMBERS * COLUMNS <= ROOM && HEIGHTS(1, MOST_ACROSS) * COLUMNS <= TILTED_ROOM, "room for one shape");
+static_assert(KEPT <= THREADS, "a thread for each shape");
+
 /* Where the numbers of a shape are: those of each column that it covers one after the other, from column `first` of the
  * strip on. */
 typedef struct {
@@ -103,8 +109,8 @@ typedef struct {
   unsigned covering[KEPT / 32][COLUMNS]; /* which of them, a bit each */
 } Book;
 
-/* Begins anew. Every thread of the block calls it, as it does the next two. */
-FN void clear(Book* book) {
+/* Begins anew. Every thread of the block calls it, as it does `reserve`. */
+FN void clear_book(Book* book) {
   __syncthreads(); /* nobody reads the shapes of the pass before */
   if (threadIdx.x < COLUMNS)
     for (int word = 0; word < KEPT / 32; ++word) book->covering[word][threadIdx.x] = 0;
@@ -120,7 +126,7 @@ FN int next_of(int rest, int many) {
  * there is room; `used` floats are taken. */
 FN int reserve(Book* book, int which, int first, int last, int left, int numbers, int room, int* used) {
   const int from = first > left ? first - left : 0, to = last < left + COLUMNS ? last - left : COLUMNS;
-  const Place place = {*used, from, to - from};
+  const Place place = {*used, from, from < to ? to - from : 0};
   if (*used + numbers * place.columns > room) return 0;
   if (threadIdx.x == which) book->places[which] = place;
   *used += numbers * place.columns;
@@ -134,19 +140,20 @@ typedef struct {
   float numbers[ROOM];
 } LevelShapes;
 
-/* Sets up the shapes of a list from `k` on, as many as find room; returns how many. Every thread of the block calls it. */
+/* Sets up the shapes of a list from `k` on, as many as find room; returns how many. Every thread of the block calls it.
+ */
 FN int set_up(const Frame* f, const int* list, int k, int found, int left, LevelShapes* to) {
   const Camera* c = &f->camera;
   const int t = threadIdx.x;
   int many = 0, used = 0, full = 0;
-  clear(&to->book);
+  clear_book(&to->book);
   while (!full && k + many < found) {
     const int staged = next_of(found - k - many, many);
     if (t < staged) upright(c, &f->shapes, &f->eye, list[k + many + t], &to->staged[t]);
     __syncthreads();
     int fit = 0;
-    while (fit < staged && reserve(&to->book, many + fit, to->staged[fit].first, to->staged[fit].last, left, NUMBERS, ROOM,
-                                   &used))
+    while (fit < staged &&
+           reserve(&to->book, many + fit, to->staged[fit].first, to->staged[fit].last, left, NUMBERS, ROOM, &used))
       ++fit;
     __syncthreads();
     for (int task = t; task < fit * COLUMNS; task += THREADS) {
@@ -269,8 +276,8 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) measure(const Batch 
   }
 }
 
-/* Lists the upright shapes from `base` on, at most one a thread, that a camera on the body may show between two columns;
- * returns how many they are. Every thread of the block calls it. */
+/* Lists the upright shapes from `base` on, at most one a thread, that a camera on the body may show between two
+ * columns; returns how many they are. Every thread of the block calls it. */
 FN int gather_tilted(const Frame* f, const Bounds* bounds, int base, int left, int right, Gathered* gathered) {
   Tilted shape;
   const int n = base + threadIdx.x;
@@ -295,7 +302,7 @@ FN int set_up_tilted(const Frame* f, const Bounds* bounds, const int* list, int 
   const Camera* c = &f->camera;
   const int t = threadIdx.x;
   int many = 0, used = 0, full = 0;
-  clear(&to->book);
+  clear_book(&to->book);
   while (!full && k + many < found) {
     const int staged = next_of(found - k - many, many);
     if (t < staged) tilted_shape(c, &f->shapes, &f->eye, bounds, list[k + many + t], &to->staged[t]);
@@ -352,9 +359,7 @@ static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(c
     Layers layers;
     layers.inserted = 0;
     for (int base = 0; base < uprights; base += THREADS) {
-      if (!listed) {
-        found = gather_tilted(&frame, &bounds, base, left, right, &gathered);
-      }
+      if (!listed) found = gather_tilted(&frame, &bounds, base, left, right, &gathered);
       for (int k = 0; k < found; k += many) {
         if (!kept) many = set_up_tilted(&frame, &bounds, gathered.list, k, found, left, &shapes);
         if (drawn)
@@ -424,11 +429,11 @@ KERNEL_ON_CPU(draw_tilted)
 KERNEL_ON_CPU(measure_tilted)
 
 /* Launches a kernel on all frames of a call. */
-#define DRAW(kernel, weighted)                                                                         \
-  if (asked_for_version(call)) return 0;                                                               \
-  Batch batch;                                                                                         \
-  XLA_FFI_Error* error = batch_of(call, weighted, 0, &batch);                                            \
-  if (error || !batch.frames) return error;                                                            \
+#define DRAW(kernel, weighted)                                \
+  if (asked_for_version(call)) return 0;                      \
+  Batch batch;                                                \
+  XLA_FFI_Error* error = batch_of(call, weighted, 0, &batch); \
+  if (error || !batch.frames) return error;                   \
   RETURN_LAUNCHED(kernel, (int64_t)batch.frames*((batch.width + COLUMNS - 1) / COLUMNS), call, batch)
 
 EXPORTED XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call) { DRAW(draw, 1); }

@@ -26,10 +26,10 @@ typedef struct {
 
 /* What pixels need of a box or a cylinder. */
 typedef struct {
-  int is_box, number, faces;                          /* of all; how many are seen */
-  float origin[3], forward[3], right[3], up[3];       /* in its own frame: the eye from its middle; the image's axes */
+  int is_box, number, faces;                    /* of all; how many are seen */
+  float origin[3], forward[3], right[3], up[3]; /* in its own frame: the eye from its middle; the image's axes */
   float radius, half_height, value, sun[2], end_bright; /* of a cylinder */
-  Front front[3];                                     /* of a box, whose far faces the eye does not see */
+  Front front[3];                                       /* of a box, whose far faces the eye does not see */
 } Seen;
 
 /* A box or a cylinder, in its own frame. */
@@ -37,7 +37,7 @@ typedef struct {
   Seen seen;
   int first, last; /* columns that it may cover, the last excluded */
   float half[3];
-  Turn turn; /* of its axes */
+  Turn turn;       /* of its axes */
   float bright[3]; /* of the faces that the eye may see */
   Face face[6];    /* of a cylinder those of the box around it, which faces the eye; all six from within */
 } Tilted;
@@ -155,8 +155,7 @@ FN void bounds_of(const Camera* c, const Eye* e, Bounds* b) {
     b->normal[1][i] = e->right[i] - edge * e->forward[i], b->normal[2][i] = -e->right[i] - edge * e->forward[i];
     b->normal[3][i] = e->up[i] - top * e->forward[i], b->normal[4][i] = -e->up[i] - top * e->forward[i];
   }
-  for (int k = 0; k < 5; ++k)
-    b->flat[k] = sqrtf(b->normal[k][0] * b->normal[k][0] + b->normal[k][1] * b->normal[k][1]);
+  for (int k = 0; k < 5; ++k) b->flat[k] = sqrtf(b->normal[k][0] * b->normal[k][0] + b->normal[k][1] * b->normal[k][1]);
 }
 
 /* Whether no part of an upright cylinder, its middle `to` [3] from the eye, can be in the image. */
