@@ -217,10 +217,8 @@ def crowded_forest(rng: np.random.Generator) -> Scene:
 
 def wide_boxes(rng: np.random.Generator) -> Scene:
     """Shapes that cover so many columns that a block has no room for all of them at once."""
-    places, halves = rng.uniform([0, 0, 0], [60, 60, 8], (100, 3)), rng.uniform([4, 4, 0.2], [9, 9, 0.6], (100, 3))
-    return scene_of(
-        GROUND, *(box(*place, *half, rng.uniform(0, 3)) for place, half in zip(places, halves, strict=True))
-    )
+    low, high = [0, 0, 0, 4, 4, 0.2, 0], [60, 60, 8, 9, 9, 0.6, 3]
+    return scene_of(GROUND, *(box(*map(float, rng.uniform(low, high))) for _ in range(100)))
 
 
 def empty_field(rng: np.random.Generator) -> Scene:
