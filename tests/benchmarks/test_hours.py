@@ -57,7 +57,8 @@ def test_a_short_turn_is_not_added(tmp_path: Path) -> None:
 def test_the_page_says_what_the_table_says() -> None:
     rows = hours.read(ROOT / "benchmarks/hours.tsv")
     page = (ROOT / "docs/performance.md").read_text(encoding="utf-8")
-    assert f"> {hours.summary(rows, rows[-1])}\n" in page
+    for row in rows:  # a line for each processor
+        assert f"> {hours.summary(rows, row)}\n" in page
 
 
 @pytest.mark.parametrize("text", ["a,b\n", "\t".join(hours.FIELDS) + "\nshort\trow\n"])
