@@ -93,7 +93,7 @@ FN int gather(Gathered* g, int n, int shown) {
 FN int column_of(int t) { return t % 8 + t / 32 % (COLUMNS / 8) * 8; }
 FN int row_of(int t) { return t / 8 % 4 + t / 128 * 4; }
 
-/* A shape in all columns finds room, else there would be no end of passes; a thread each writes where shapes are. */
+/* A shape that covers all columns finds room, else passes had no end; where a shape is, a thread of its own writes. */
 static_assert(NUMBERS * COLUMNS <= ROOM && HEIGHTS(1, MOST_ACROSS) * COLUMNS <= TILTED_ROOM, "room for one shape");
 static_assert(KEPT <= THREADS, "a thread for each shape");
 
@@ -140,8 +140,7 @@ typedef struct {
   float numbers[ROOM];
 } LevelShapes;
 
-/* Sets up the shapes of a list from `k` on, as many as find room; returns how many. Every thread of the block calls it.
- */
+/* Sets up the shapes of a list from `k` on, as many as find room, and returns how many; called by every thread. */
 FN int set_up(const Frame* f, const int* list, int k, int found, int left, LevelShapes* to) {
   const Camera* c = &f->camera;
   const int t = threadIdx.x;

@@ -26,7 +26,7 @@ typedef struct {
 
 /* What pixels need of a box or a cylinder. */
 typedef struct {
-  int is_box, number, faces;                    /* of all; how many are seen */
+  int is_box, number, faces;                    /* its number among all shapes; how many of its faces are seen */
   float origin[3], forward[3], right[3], up[3]; /* in its own frame: the eye from its middle; the image's axes */
   float radius, half_height, value, sun[2], end_bright; /* of a cylinder */
   Front front[3];                                       /* of a box, whose far faces the eye does not see */
@@ -226,7 +226,7 @@ FN Lanes nearer_tilted(const Shapes* s, const Eye* e, const Tilted* p, const flo
   return nearer_upright(level_of(s, e, p->seen.number), from, to, inverses(dz), nearest);
 }
 
-#define HEIGHTS(is_box, across) (2 + ((is_box) ? 6 : 2) * (across)) /* arrays of `stride` that it writes at most */
+#define HEIGHTS(is_box, across) (2 + ((is_box) ? 6 : 2) * (across)) /* arrays that `write_heights` writes at most */
 
 /* Writes what LANES columns at `u` need of a shape, in arrays that are `stride` apart: the heights between which rows
  * may show it, then low and high of every ray across, of a box for each of its faces. */
