@@ -5,8 +5,9 @@
 The first folder has a folder of rows for each learner (`dqn`, `pqn`, `imitation`, `teacher`), all of events; the second
 the rows of the map itself, whose events by DQN are a second training of the same seeds, pooled with those of `dqn`, and
 whose blind agent stands beside them. In the second table are sensors that were taught by one policy (folders `taught`,
-`taught_teacher`), beside the rows of the map, where they learn by DQN. Cells of two times to impact are pooled.
-Intervals are a bootstrap over seeds and missions.
+`taught_teacher`), beside the rows of the map, where they learn by DQN. In the third are events and frames of one more
+teacher (folder `one_teacher`). Cells of two times to impact are pooled. Intervals are a bootstrap over seeds and
+missions.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ COLUMNS = {"blind": "blind", "pqn": "PQN", "dqn": "DQN, two trainings", "imitati
 
 
 TAUGHT = {"frames": "one frame", "frame-pair": "pair", "frame-pair@120": "pair, 120 a second"}
+ONE_TEACHER = {"depth": "teacher", "events": "events", "frames": "one frame"}
 
 
 def arrived(rows: list[success.Row], cells: list[str]) -> np.ndarray:
@@ -40,7 +42,7 @@ def _digits(seeds: list[str]) -> np.ndarray:
 
 
 def main(learners: Path, others: Path) -> None:
-    """Prints both tables of the rows in two folders."""
+    """Prints the three tables of the rows in two folders."""
     own.register()
     of_map = {row["sensor"]: [row] for row in table.rows_of(success.read_rows(others), "age")}
     rows = {name: success.read_rows(learners / name) for name in COLUMNS if name != "blind"}
@@ -54,6 +56,10 @@ def main(learners: Path, others: Path) -> None:
     rows |= {f"{name} by DQN": of_map[name] for name in taught}
     leads = {f"{title} ahead of DQN by": (name, f"{name} by DQN") for name, title in TAUGHT.items()}
     _print_table(rows, {"teacher": "teacher"} | TAUGHT, leads)
+    print()
+    rows = {row["sensor"]: [row] for row in success.read_rows(learners / "one_teacher")}
+    leads = {"events ahead of one frame by": ("events", "frames"), "events behind the teacher by": ("depth", "events")}
+    _print_table(rows, ONE_TEACHER, leads)
 
 
 def _print_table(

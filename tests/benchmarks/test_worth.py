@@ -151,6 +151,11 @@ def test_learners_stand_in_one_table_with_both_trainings_of_dqn(
         for sensor, rate in taught.items()
     }
     rows["learners/taught_teacher/a-b-c.json"] = row("depth", 0.9, dict.fromkeys(flown, 0.9), **at)
+    one_teacher = {"depth": 0.8, "events": 0.6, "frames": 0.7}
+    rows |= {
+        f"learners/one_teacher/a-b-{sensor}.json": row(sensor, rate, dict.fromkeys(flown, rate), **at)
+        for sensor, rate in one_teacher.items()
+    }
     of_map = {"events": 0.7, "blind": 0.1, "frames": 0.2, "frame-pair": 0.4, "frame-pair@120": 0.8}
     rows |= {f"map/a-b-{name}.json": row(name, rate, dict.fromkeys(flown, rate), **at) for name, rate in of_map.items()}
     for name, one in rows.items():
@@ -158,13 +163,15 @@ def test_learners_stand_in_one_table_with_both_trainings_of_dqn(
         (tmp_path / name).write_text(json.dumps(one))
     script = runpy.run_path(str(Path(__file__).parents[2] / "scripts" / "learners.py"))
     script["main"](tmp_path / "learners", tmp_path / "map")
-    first, second = ([*text.splitlines()] for text in capsys.readouterr().out.split("\n\n"))
+    first, second, third = ([*text.splitlines()] for text in capsys.readouterr().out.split("\n\n"))
     assert len(first) == len(second) == 8 and "DQN, two trainings" in first[0]
     cells = ["6", "0.3 to 0.5 s", "10.0", "25.0", "60.0", "100.0", "100.0", "**40.0**", "**35.0**"]
     assert [cell.strip().partition(" (")[0] for cell in first[2].strip("|").split("|")] == cells
     assert "pair, 120 a second ahead of DQN by" in second[0]
     cells = ["12", "0.5 to 1 s", "90.0", "30.0", "40.0", "50.0", "**10.0**", "0.0", "**-30.0**"]
     assert [cell.strip().partition(" (")[0] for cell in second[7].strip("|").split("|")] == cells
+    cells = ["6", "0.3 to 0.5 s", "80.0", "60.0", "70.0", "**-10.0**", "**20.0**"]
+    assert [cell.strip().partition(" (")[0] for cell in third[2].strip("|").split("|")] == cells
 
 
 def test_rows_of_two_learners_are_not_compared() -> None:
