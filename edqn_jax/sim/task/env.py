@@ -35,6 +35,7 @@ from edqn_jax.sim.task.group import Turn
 from edqn_jax.sim.task.missions import Missions
 from edqn_jax.sim.task.observation import Observation, View, observe, poses_at_start, sensor_poses, with_times
 from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.renewal import renew
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.worlds import geodesic
 
@@ -97,7 +98,7 @@ class _Start:
     """The beginning of an episode."""
 
     drone: DroneState  # at rest at the mission's start, facing its goal
-    memory: SensorMemory  # of a sensor at rest
+    sensor: Array  # key of the sensor at rest
     disturbance: Disturbance | None  # what the episode will fly against
 
 
@@ -112,7 +113,7 @@ def _start(config: Config, env_params: EnvParams, mission: Array, key: Array) ->
         )
     if disturbance is not None and config.env.action_delay:
         disturbance = dataclasses.replace(disturbance, move=jnp.asarray(action_set(config).still))
-    return _Start(drone.hover_state(start, yaw), sensor.at_rest(config, key), disturbance)
+    return _Start(drone.hover_state(start, yaw), key, disturbance)
 
 
 def nearness(config: Config, env_params: EnvParams, state: EnvState) -> Array:
@@ -158,7 +159,7 @@ def before_reset(config: Config, env_params: EnvParams, key: Array, mission: Arr
         mission=mission.astype(jnp.int32),
         decision=jnp.zeros((), jnp.int32),
         ended=jnp.ones((), bool),
-        memory=start.memory,
+        memory=sensor.at_rest(config, start.sensor),
         episode_return=jnp.zeros(()),
         key=key,
         disturbance=start.disturbance,
@@ -231,7 +232,7 @@ def step(
         poses=sensor_poses(config, first, done.flight),
         disturbance=done.disturbance,
     )
-    memory = select_tree(turn.is_reset, start.memory, state.memory)
+    memory = renew(config, turn.is_reset, start.sensor, state.memory)
     observation, memory, observation_nonfinite = _sense(config, turn, view, memory, keys.noise)
     outcome = jnp.where(observation_nonfinite, int(Outcome.DIVERGED), done.verdict.outcome)
     decision = turn.decisions_after(state.decision)
