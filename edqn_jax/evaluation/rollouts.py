@@ -22,6 +22,7 @@ from edqn_jax.evaluation import decoder
 from edqn_jax.kept_programs import Place, named, place_of, without_seed
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
+from edqn_jax.native.threefry import drawn_in_c
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.action_sets import describe_space
@@ -233,11 +234,12 @@ def _lower(
         first.out_info,
         _layout(mesh, first.out_info),
     )
-    return [
-        first.lower(),
-        fly_on.lower(program, env_params, params, flying, NO_END),
-        end.lower(_count(env_params), flying),
-    ]
+    with drawn_in_c():
+        return [
+            first.lower(),
+            fly_on.lower(program, env_params, params, flying, NO_END),
+            end.lower(_count(env_params), flying),
+        ]
 
 
 def _without_static(compiled: jax.stages.Compiled) -> Callable[..., Any]:

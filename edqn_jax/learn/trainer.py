@@ -29,6 +29,7 @@ from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import Episodes, Losses, TrainState, init_state
 from edqn_jax.learn.step import run_steps
 from edqn_jax.learn.updates import begin_networks
+from edqn_jax.native.threefry import drawn_in_c
 from edqn_jax.sim.task.env import EnvParams
 
 AXIS = "env"
@@ -95,7 +96,8 @@ class Trainer:
         arguments = self.env_params, keys[0] if self.agents is None else jnp.stack(keys)
         place = Place(None) if start is not None else self._place_of("first_state", arguments)
         function = jax.jit(named(self._each(begin, 0), place.name))
-        [make] = place.load_or_compile(lambda: [function.lower(*arguments)], [*self.mesh.devices.flat])
+        with drawn_in_c():
+            [make] = place.load_or_compile(lambda: [function.lower(*arguments)], [*self.mesh.devices.flat])
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
         return jax.jit(lambda state: state, out_shardings=self._layout())(make(*arguments))
 
@@ -193,9 +195,9 @@ class Trainer:
             check_vma=False,
         )
         assert self._place is not None
-        return jax.jit(named(run, self._place.name), donate_argnums=1).lower(
-            self.env_params, self.shapes(), self._steps(0)
-        )
+        program = jax.jit(named(run, self._place.name), donate_argnums=1)
+        with drawn_in_c():
+            return program.lower(self.env_params, self.shapes(), self._steps(0))
 
     def _steps(self, first: int) -> Array:
         numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)

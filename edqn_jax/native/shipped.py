@@ -25,7 +25,13 @@ FOLDER = Path(__file__).with_name("built")
 COMPILER = "compiler.txt"
 """In this folder: name and version of what compiled the library."""
 
-SOURCES = ("native/all_sum.c", "native/products.c", "sim/camera/pictures.c", "sim/scene/shapes/field_rays.c")
+SOURCES = (
+    "native/all_sum.c",
+    "native/products.c",
+    "native/threefry.c",
+    "sim/camera/pictures.c",
+    "sim/scene/shapes/field_rays.c",
+)
 """What is in it, below the package."""
 
 FLAGS = (

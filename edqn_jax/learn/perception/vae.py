@@ -107,7 +107,8 @@ def decoder_target(config: EncoderConfig, sensed: EventField | Array, nearness: 
     if config.target_blur == 0:
         return image
     height, width = image.shape[-2:]
-    return jnp.asarray(_blur(height, config.target_blur)) @ image @ jnp.asarray(_blur(width, config.target_blur).T)
+    # Along rows first: XLA transposes what is multiplied from the left, and with it would compute the label in columns.
+    return jnp.asarray(_blur(height, config.target_blur)) @ (image @ jnp.asarray(_blur(width, config.target_blur).T))
 
 
 def _input_channels(sensed: EventField | Array) -> Array:

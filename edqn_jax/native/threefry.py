@@ -1,0 +1,97 @@
+"""JAX's random bits on CPUs by one call in C, where programs are lowered that draw a few numbers in many places.
+
+JAX lowers Threefry on CPUs to a loop of five turns with a dozen operations each. Of a hundred numbers, starting these
+takes far longer than their arithmetic, and each loop is compiled anew. The bits are the same.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import contextvars
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.extend.random import threefry2x32_p
+from jax.interpreters import mlir
+
+from edqn_jax.native.build import ensure_registered
+
+SOURCE = Path(__file__).with_suffix(".c")
+
+TARGET = "edqn_threefry"
+
+ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+PARITY = 0x1BD11BDA
+
+_IN_C = contextvars.ContextVar("random bits are drawn in C", default=False)
+
+
+@contextlib.contextmanager
+def drawn_in_c() -> Iterator[None]:
+    """Has `jax.random` draw in C in programs for CPUs that are lowered within; elsewhere it draws as ever.
+
+    Nothing changes where there is no compiler, and for arrays that the compiler may spread over several devices: it
+    cannot divide a call.
+    """
+    _register()
+    token = _IN_C.set(True)
+    try:
+        yield
+    finally:
+        _IN_C.reset(token)
+
+
+def is_available() -> bool:
+    """Returns whether the library is loaded and registered, which the first call does."""
+    return ensure_registered(SOURCE, (TARGET,))
+
+
+@functools.cache
+def _register() -> None:
+    mlir.register_lowering(threefry2x32_p, _lower, platform="cpu")
+
+
+def _lower(context: Any, *arrays: Any) -> Any:
+    in_c = _IN_C.get() and _is_on_one_device(context.module_context.axis_context) and is_available()
+    return mlir.lower_fun(draw_in_c if in_c else draw_in_loop, multiple_results=True)(context, *arrays)
+
+
+def _is_on_one_device(context: Any) -> bool:
+    """Returns whether each device is told apart where a program is lowered: there is one, or `shard_map` parted them.
+
+    Args:
+        context: of the module that is lowered, one of JAX's `ShardingContext` and `SPMDAxisContext`.
+    """
+    if hasattr(context, "manual_axes"):
+        return context.manual_axes >= set(context.mesh.axis_names)
+    return getattr(context, "num_devices", None) == 1
+
+
+def draw_in_c(*arrays: Array) -> list[Array]:
+    """Returns both words of Threefry's bits, uint32 [...], of both words of keys and counts, which are broadcast."""
+    arrays = tuple(jnp.broadcast_arrays(*arrays))
+    bits = jax.ShapeDtypeStruct(arrays[0].shape, jnp.uint32)
+    return jax.ffi.ffi_call(TARGET, (bits, bits))(*arrays)
+
+
+def draw_in_loop(*arrays: Array) -> tuple[Array, Array]:
+    """Returns the same as `draw_in_c`, as JAX lowers it: a loop with four rounds a turn, so that little is compiled."""
+    first, second, x, y = jnp.broadcast_arrays(*arrays)
+    third = first ^ second ^ np.uint32(PARITY)
+    rotations = tuple(jnp.asarray(row, jnp.uint32) for row in ROTATIONS)
+
+    def turn(number: Array, now: Any) -> Any:
+        (x, y), (key, following, last), (these, others) = now
+        for rotation in these:
+            x = x + y
+            y = x ^ ((y << rotation) | (y >> (np.uint32(32) - rotation)))
+        x, y = x + key, y + following + jnp.uint32(number + 1)
+        return (x, y), (following, last, key), (others, these)
+
+    return lax.fori_loop(0, 5, turn, ((x + first, y + second), (second, third, first), rotations))[0]
