@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edqn_jax.config import CameraConfig, EncoderConfig
 from edqn_jax.extras import require_extra
 from edqn_jax.learn.perception.code import MAX_LOG_VARIANCE, MAX_MEAN
-from edqn_jax.learn.perception.patch_encoder import patch_places
+from edqn_jax.learn.perception.patches import patch_places
 from edqn_jax.learn.perception.vae import init_vae
 from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosine_basis
 

@@ -27,6 +27,7 @@ COMPILER = "compiler.txt"
 
 SOURCES = (
     "native/all_sum.c",
+    "learn/perception/patches.c",
     "native/products.c",
     "native/threefry.c",
     "sim/camera/pictures.c",

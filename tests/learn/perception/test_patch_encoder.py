@@ -14,7 +14,8 @@ import pytest
 from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form
-from edqn_jax.learn.perception.patch_encoder import log_counts, patch_places, to_patches
+from edqn_jax.learn.perception.patch_encoder import log_counts
+from edqn_jax.learn.perception.patches import patch_places, to_patches
 from edqn_jax.native.products import in_precision
 from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task.observation import MOTION_SIZE
