@@ -15,7 +15,6 @@ from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form
 from edqn_jax.learn.perception.patch_encoder import log_counts
-from edqn_jax.learn.perception.patches import patch_places, to_patches
 from edqn_jax.native.products import in_precision
 from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task.observation import MOTION_SIZE
@@ -84,28 +83,7 @@ def test_both_polarities_of_a_pixel_are_counted_apart() -> None:
     polarity = np.array([1, -1], np.int8).reshape(2, 1, 1)
     times = jnp.zeros((2, 1, 1))
     field = event_field.EventField(jnp.asarray(blank), jnp.asarray(polarity), times, times, 0.04, with_noise=True)
-    np.testing.assert_allclose([float(x[0, 0]) for x in log_counts(field)], np.log([4.0, 3.0]), rtol=1e-6)
-
-
-def test_patches_are_cut_row_by_row_and_padded_with_zeros() -> None:
-    image = jnp.arange(1.0, 61.0).reshape(6, 10)
-    cut = np.asarray(to_patches(image, 4))
-    assert cut.shape == (6, 16)
-    np.testing.assert_array_equal(cut[1].reshape(4, 4), image[:4, 4:8])
-    np.testing.assert_array_equal(cut[5].reshape(4, 4)[:2, :2], image[4:, 8:])
-    assert cut[5].reshape(4, 4)[2:].sum() == cut[5].reshape(4, 4)[:, 2:].sum() == 0.0
-    np.testing.assert_allclose(patch_places(6, 10, 4)[:3], [[-0.6, -1 / 3], [0.2, -1 / 3], [1.0, -1 / 3]], atol=1e-6)
-
-
-def test_patches_that_overlap_see_the_pixels_around_them_and_zeros_beyond_the_image() -> None:
-    image = np.arange(1.0, 61.0).reshape(6, 10)
-    cut = np.asarray(to_patches(jnp.stack([jnp.asarray(image), -jnp.asarray(image)]), 4, overlap=2))
-    wide = np.pad(image, [(2, 4), (2, 4)])
-    for number in range(6):
-        row, column = divmod(number, 3)
-        window = wide[4 * row : 4 * row + 8, 4 * column : 4 * column + 8].ravel()
-        np.testing.assert_array_equal(cut[0, number], window)
-        np.testing.assert_array_equal(cut[1, number], -window)
+    np.testing.assert_allclose([float(x[0, 0]) for x in log_counts(field, 1)], np.log([4.0, 3.0]), rtol=1e-6)
 
 
 def test_the_same_events_mean_something_else_under_another_motion() -> None:
