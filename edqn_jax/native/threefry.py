@@ -73,11 +73,12 @@ def _is_on_one_device(context: Any) -> bool:
     return getattr(context, "num_devices", None) == 1
 
 
-def draw_in_c(*arrays: Array) -> list[Array]:
+def draw_in_c(*arrays: Array) -> tuple[Array, Array]:
     """Returns both words of Threefry's bits, uint32 [...], of both words of keys and counts, which are broadcast."""
     arrays = tuple(jnp.broadcast_arrays(*arrays))
     bits = jax.ShapeDtypeStruct(arrays[0].shape, jnp.uint32)
-    return jax.ffi.ffi_call(TARGET, (bits, bits))(*arrays)
+    first, second = jax.ffi.ffi_call(TARGET, (bits, bits))(*arrays)
+    return first, second
 
 
 def draw_in_loop(*arrays: Array) -> tuple[Array, Array]:

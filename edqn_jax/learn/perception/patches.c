@@ -33,7 +33,7 @@ XLA_FFI_Error* edqn_signed_patches(XLA_FFI_CallFrame* call) {
   for (int i = 0; i < image->rank - 2; ++i) images *= image->dims[i];
   float* positive = (float*)((XLA_FFI_Buffer*)call->rets.rets[0])->data;
   float* negative = (float*)((XLA_FFI_Buffer*)call->rets.rets[1])->data;
-  if (side == 4)  /* the usual one, of which the compiler knows the number */
+  if (side == 4) /* the usual one, of which the compiler knows the number */
     cut((const float*)image->data, images, height / 4, width / 4, 4, positive, negative);
   else
     cut((const float*)image->data, images, height / side, width / side, side, positive, negative);
