@@ -13,6 +13,7 @@ missions.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
@@ -51,15 +52,21 @@ def main(learners: Path, others: Path) -> None:
         rows, COLUMNS, {"imitation ahead of DQN by": ("imitation", "dqn"), "PQN behind DQN by": ("dqn", "pqn")}
     )
     print()
-    taught = {row["sensor"]: [row] for row in success.read_rows(learners / "taught")}
+    taught = _by_sensor(learners / "taught", TAUGHT)
     rows = {"teacher": success.read_rows(learners / "taught_teacher"), **taught}
     rows |= {f"{name} by DQN": of_map[name] for name in taught}
     leads = {f"{title} ahead of DQN by": (name, f"{name} by DQN") for name, title in TAUGHT.items()}
     _print_table(rows, {"teacher": "teacher"} | TAUGHT, leads)
     print()
-    rows = {row["sensor"]: [row] for row in success.read_rows(learners / "one_teacher")}
+    rows = _by_sensor(learners / "one_teacher", ONE_TEACHER)
     leads = {"events ahead of one frame by": ("events", "frames"), "events behind the teacher by": ("depth", "events")}
     _print_table(rows, ONE_TEACHER, leads)
+
+
+def _by_sensor(folder: Path, sensors: Iterable[str]) -> dict[str, list[success.Row]]:
+    """Returns the rows of a folder in the order of these sensors: a bootstrap draws for one after the other."""
+    rows = success.read_rows(folder)
+    return {sensor: [row for row in rows if row["sensor"] == sensor] for sensor in sensors}
 
 
 def _print_table(

@@ -16,7 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.native.threefry import drawn_in_c
+from edqn_jax.native.own_programs import own_program
 
 TURN_SECONDS = 0.4
 """Approximate duration of a turn of a part."""
@@ -74,7 +74,7 @@ class Timed:
         specs = (*part.specs, PartitionSpec())
         spread = jax.shard_map(loop, mesh=mesh, in_specs=specs, out_specs=part.specs[1], check_vma=False)
         options = compiler_options(mesh.devices.flat[0].platform)
-        with drawn_in_c():  # as a trainer's programs are
+        with own_program():  # as a trainer's programs are
             lowered = jax.jit(spread).lower(*self.inputs, jnp.int32(1))
         self.loop = lowered.compile(options)
         first = min(self.seconds(1) for _ in range(2))

@@ -22,7 +22,8 @@ from edqn_jax.evaluation import decoder
 from edqn_jax.kept_programs import Place, named, place_of, without_seed
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
-from edqn_jax.native.threefry import drawn_in_c
+from edqn_jax.native.own_programs import own_program
+from edqn_jax.native.threefry import draw_own_in_c
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.action_sets import describe_space
@@ -228,13 +229,14 @@ def _lower(
     place: Place, program: _Program, mesh: Mesh, env_params: EnvParams, params: Any, key: Array
 ) -> list[jax.stages.Lowered]:
     begin, fly_on, end = _programs(mesh, place.name)
-    first = begin.trace(program, env_params, params, key)
-    flying = jax.tree.map(
-        lambda leaf, layout: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=layout),
-        first.out_info,
-        _layout(mesh, first.out_info),
-    )
-    with drawn_in_c():
+    draw_own_in_c()
+    with own_program():
+        first = begin.trace(program, env_params, params, key)
+        flying = jax.tree.map(
+            lambda leaf, layout: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=layout),
+            first.out_info,
+            _layout(mesh, first.out_info),
+        )
         return [
             first.lower(),
             fly_on.lower(program, env_params, params, flying, NO_END),

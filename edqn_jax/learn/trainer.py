@@ -29,7 +29,8 @@ from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import Episodes, Losses, TrainState, init_state
 from edqn_jax.learn.step import run_steps
 from edqn_jax.learn.updates import begin_networks
-from edqn_jax.native.threefry import drawn_in_c
+from edqn_jax.native.own_programs import own_program
+from edqn_jax.native.threefry import draw_own_in_c
 from edqn_jax.sim.task.env import EnvParams
 
 AXIS = "env"
@@ -73,6 +74,7 @@ class Trainer:
         self._traced: jax.stages.Lowered | None = None
         self._shapes: TrainState | None = None
         self._chunk = None
+        draw_own_in_c()
 
     def init(self, seed: int | Sequence[int], start: Policy | None = None) -> TrainState:
         """Returns the state before the first step, laid out over the devices.
@@ -96,7 +98,7 @@ class Trainer:
         arguments = self.env_params, keys[0] if self.agents is None else jnp.stack(keys)
         place = Place(None) if start is not None else self._place_of("first_state", arguments)
         function = jax.jit(named(self._each(begin, 0), place.name))
-        with drawn_in_c():
+        with own_program():
             [make] = place.load_or_compile(lambda: [function.lower(*arguments)], [*self.mesh.devices.flat])
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
         return jax.jit(lambda state: state, out_shardings=self._layout())(make(*arguments))
@@ -196,7 +198,7 @@ class Trainer:
         )
         assert self._place is not None
         program = jax.jit(named(run, self._place.name), donate_argnums=1)
-        with drawn_in_c():
+        with own_program():
             return program.lower(self.env_params, self.shapes(), self._steps(0))
 
     def _steps(self, first: int) -> Array:

@@ -1,4 +1,4 @@
-"""JAX's random bits on CPUs by one call in C, where programs are lowered that draw a few numbers in many places.
+"""JAX's random bits on CPUs by one call in C, in programs that draw a few numbers in many places.
 
 JAX lowers Threefry on CPUs to a loop of five turns with a dozen operations each. Of a hundred numbers, starting these
 takes far longer than their arithmetic, and each loop is compiled anew. The bits are the same.
@@ -6,10 +6,7 @@ takes far longer than their arithmetic, and each loop is compiled anew. The bits
 
 from __future__ import annotations
 
-import contextlib
-import contextvars
 import functools
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +18,7 @@ from jax.extend.random import threefry2x32_p
 from jax.interpreters import mlir
 
 from edqn_jax.native.build import ensure_registered
+from edqn_jax.native.own_programs import is_own_program
 
 SOURCE = Path(__file__).with_suffix(".c")
 
@@ -29,22 +27,15 @@ TARGET = "edqn_threefry"
 ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 PARITY = 0x1BD11BDA
 
-_IN_C = contextvars.ContextVar("random bits are drawn in C", default=False)
 
+@functools.cache
+def draw_own_in_c() -> None:
+    """Has `jax.random` draw in C in the package's own programs for CPUs, see `own_program`.
 
-@contextlib.contextmanager
-def drawn_in_c() -> Iterator[None]:
-    """Has `jax.random` draw in C in programs for CPUs that are lowered within; elsewhere it draws as ever.
-
-    Nothing changes where there is no compiler, and for arrays that the compiler may spread over several devices: it
-    cannot divide a call.
+    JAX's lowering of Threefry on CPUs is replaced in this process. Others' programs draw in a loop like JAX's, and so
+    does what cannot be C: where there is no compiler, and arrays that XLA may spread over several devices.
     """
-    _register()
-    token = _IN_C.set(True)
-    try:
-        yield
-    finally:
-        _IN_C.reset(token)
+    mlir.register_lowering(threefry2x32_p, _lower, platform="cpu")
 
 
 def is_available() -> bool:
@@ -52,13 +43,8 @@ def is_available() -> bool:
     return ensure_registered(SOURCE, (TARGET,))
 
 
-@functools.cache
-def _register() -> None:
-    mlir.register_lowering(threefry2x32_p, _lower, platform="cpu")
-
-
 def _lower(context: Any, *arrays: Any) -> Any:
-    in_c = _IN_C.get() and _is_on_one_device(context.module_context.axis_context) and is_available()
+    in_c = is_own_program() and _is_on_one_device(context) and is_available()
     return mlir.lower_fun(draw_in_c if in_c else draw_in_loop, multiple_results=True)(context, *arrays)
 
 
@@ -66,11 +52,12 @@ def _is_on_one_device(context: Any) -> bool:
     """Returns whether each device is told apart where a program is lowered: there is one, or `shard_map` parted them.
 
     Args:
-        context: of the module that is lowered, one of JAX's `ShardingContext` and `SPMDAxisContext`.
+        context: of the lowering. Of what a later JAX calls otherwise, the answer is no.
     """
-    if hasattr(context, "manual_axes"):
-        return context.manual_axes >= set(context.mesh.axis_names)
-    return getattr(context, "num_devices", None) == 1
+    axes = getattr(getattr(context, "module_context", None), "axis_context", None)
+    if hasattr(axes, "manual_axes") and hasattr(axes, "mesh"):
+        return axes.manual_axes >= set(axes.mesh.axis_names)
+    return getattr(axes, "num_devices", None) == 1
 
 
 def draw_in_c(*arrays: Array) -> tuple[Array, Array]:

@@ -25,6 +25,7 @@ from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.missions import MissionSet, missions_of_runs
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.learner import learner_of
+from edqn_jax.learn.perception import patches
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.learn.state import TrainState
 from edqn_jax.learn.trainer import Trainer
@@ -236,6 +237,7 @@ def _load_libraries(config: Config, devices: int) -> None:
     products.precision_of(config.train.products)
     if on_cpu:
         threefry.is_available()
+        patches.is_available()
     if on_cpu and devices > 1 and jax.process_count() == 1:
         all_sum.is_available()
 

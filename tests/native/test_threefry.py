@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from edqn_jax.native.threefry import TARGET, draw_in_c, draw_in_loop, drawn_in_c, is_available
+from edqn_jax.native.own_programs import own_program
+from edqn_jax.native.threefry import TARGET, draw_in_c, draw_in_loop, draw_own_in_c, is_available
 
 HAS_COMPILER = shutil.which("cc") is not None
+draw_own_in_c()
 MESH = Mesh(np.asarray(jax.devices()[:2]), ("d",))
 
 
@@ -22,7 +24,7 @@ def lowered(function: Callable[..., Any], *arguments: Any, in_c: bool) -> jax.st
     program = jax.jit(lambda *arguments: function(*arguments))  # a new one: what is lowered once is kept
     if not in_c:
         return program.lower(*arguments)
-    with drawn_in_c():
+    with own_program():
         return program.lower(*arguments)
 
 
@@ -75,7 +77,5 @@ def test_devices_of_shard_map_draw_in_c_each_and_what_the_compiler_spreads_does_
 
 
 def test_programs_that_are_lowered_elsewhere_can_be_exported() -> None:
-    with drawn_in_c():
-        pass
     exported = jax.export.export(jax.jit(lambda key: jax.random.normal(key, (3,))))(jax.random.key(0))
     np.testing.assert_array_equal(exported.call(jax.random.key(0)), jax.random.normal(jax.random.key(0), (3,)))

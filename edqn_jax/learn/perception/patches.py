@@ -10,6 +10,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.native.build import ensure_registered
+from edqn_jax.native.own_programs import is_own_program
 
 SOURCE = Path(__file__).with_suffix(".c")
 
@@ -41,11 +42,12 @@ def to_patches(image: Array, pixels: int, overlap: int = 0) -> Array:
 def signed_patches(image: Array, pixels: int, overlap: int = 0) -> tuple[Array, Array]:
     """Returns what is above 0 in images `[..., H, W]`, and how far the rest is below, each cut as by `to_patches`.
 
-    On CPUs with a C compiler `patches.c` does both at once.
+    In the package's own programs `patches.c` does both at once, on CPUs with a C compiler. It takes NaN for 0.
     """
     *batch, height, width = image.shape
     whole = not (overlap or height % pixels or width % pixels)
-    if not whole or image.dtype != jnp.float32 or jax.default_backend() != "cpu" or not is_available():
+    in_c = is_own_program() and whole and image.dtype == jnp.float32 and jax.default_backend() == "cpu"
+    if not in_c or not is_available():
         cut = to_patches(image, pixels, overlap)
         return jnp.maximum(cut, 0.0), jnp.maximum(-cut, 0.0)
     count = (height // pixels) * (width // pixels)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.learn.perception.patches import TARGET, patch_places, signed_patches, to_patches
+from edqn_jax.native.own_programs import own_program
 
 
 def test_patches_are_cut_row_by_row_and_padded_with_zeros() -> None:
@@ -41,18 +42,28 @@ def test_signed_images_are_cut_into_what_is_above_zero_and_what_is_below(
 ) -> None:
     rng = np.random.default_rng(3)
     images = rng.choice([-1.5, 0.0, 2.5], (2, 3, *size)).astype(np.float32) * rng.random((2, 3, *size), np.float32)
-    above, below = jax.jit(lambda x: signed_patches(x, pixels, overlap))(images)
+    with own_program():
+        above, below = jax.jit(lambda x: signed_patches(x, pixels, overlap))(images)
     cut = np.asarray(to_patches(jnp.asarray(images), pixels, overlap))
     np.testing.assert_array_equal(above, np.where(cut > 0, cut, 0))
     np.testing.assert_array_equal(below, np.where(cut < 0, -cut, 0))
-    mapped = jax.vmap(lambda x: signed_patches(x, pixels, overlap), in_axes=1, out_axes=1)(images)
+    with own_program():
+        mapped = jax.vmap(lambda x: signed_patches(x, pixels, overlap), in_axes=1, out_axes=1)(images)
     np.testing.assert_array_equal(mapped[0], above)
     np.testing.assert_array_equal(mapped[1], below)
 
 
 def test_where_there_is_a_compiler_c_cuts_what_it_can() -> None:
     def text(shape: tuple[int, ...], **options: int) -> str:
-        return jax.jit(lambda x: signed_patches(x, 4, **options)).lower(jnp.zeros(shape)).as_text()
+        with own_program():
+            return jax.jit(lambda x: signed_patches(x, 4, **options)).lower(jnp.zeros(shape)).as_text()
 
     assert (TARGET in text((2, 24, 32))) is (shutil.which("cc") is not None)
     assert TARGET not in text((2, 6, 10)) and TARGET not in text((2, 8, 8), overlap=1)
+
+
+def test_programs_of_others_can_be_exported_and_differentiated() -> None:
+    image = jnp.linspace(-1.0, 1.0, 64).reshape(8, 8)
+    assert TARGET not in jax.jit(lambda x: signed_patches(x, 4)).lower(image).as_text()
+    jax.export.export(jax.jit(lambda x: signed_patches(x, 4)))(image)
+    np.testing.assert_array_equal(jax.grad(lambda x: jnp.sum(signed_patches(x, 4)[0]))(image), image > 0)
