@@ -8,11 +8,12 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
 
-QUICK_TO_COMPILE = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-)
+QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+if metadata.version("jaxlib").startswith("0.10."):  # XLA ends the process at a flag that it does not know
+    QUICK_TO_COMPILE += " --xla_cpu_use_fusion_emitters=false"
 """XLA's flags with which a program compiles in less than half the time: what runs once need not be fast.
 
 Nor is it cut up for several threads, since each core has another process. What the package compiles with options of
