@@ -54,7 +54,7 @@ def _is_on_one_device(context: Any) -> bool:
     Args:
         context: of the lowering. Of what a later JAX calls otherwise, the answer is no.
     """
-    axes = getattr(getattr(context, "module_context", None), "axis_context", None)
+    axes: Any = getattr(getattr(context, "module_context", None), "axis_context", None)
     if hasattr(axes, "manual_axes") and hasattr(axes, "mesh"):
         return axes.manual_axes >= set(axes.mesh.axis_names)
     return getattr(axes, "num_devices", None) == 1
