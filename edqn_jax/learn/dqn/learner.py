@@ -93,7 +93,7 @@ def update_q(
         batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
         (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(state.q, state.target, batch)
         gradient, total, count, sum_q = all_sum((gradient, total, count, sum_q), axis, after)
-        gradient = gradient * (1.0 / jnp.maximum(count, 1.0))
+        gradient = gradient * (1.0 / jnp.maximum(count, 1.0))  # a quotient for each number takes longer on CPUs
         change, optimiser = _optimiser(config).update(gradient, state.q_optimiser, state.q)
         q, finite = optax.apply_updates(state.q, change), is_finite(gradient)
 

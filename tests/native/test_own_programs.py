@@ -1,0 +1,44 @@
+"""The package's own programs do small work in C, and know it where they are traced and lowered."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from edqn_jax.evaluation import rollouts
+from edqn_jax.kept_programs import Place
+from edqn_jax.learn.actor import AgentActor
+from edqn_jax.learn.perception import patches
+from edqn_jax.learn.policy import fresh_policy
+from edqn_jax.learn.trainer import Trainer
+from edqn_jax.native import threefry
+from tests.support.configs import TINY
+from tests.support.miniature import miniature_world
+
+CONFIG = dataclasses.replace(TINY, camera=dataclasses.replace(TINY.camera, width=8, height=8))
+"""Images that can be cut into whole patches."""
+
+DONE_IN_C = [shutil.which("cc") is not None] * 2
+
+
+def done_in_c(program: jax.stages.Lowered) -> list[bool]:
+    """Returns whether a program draws its random bits in C, and cuts its patches."""
+    return [f"@{target}" in program.as_text() for target in (threefry.TARGET, patches.TARGET)]
+
+
+def test_training_draws_and_cuts_in_c() -> None:
+    trainer = Trainer(CONFIG, miniature_world(CONFIG), jax.devices()[:2])
+    trainer.trace()
+    assert trainer._traced is not None and done_in_c(trainer._traced) == DONE_IN_C
+
+
+def test_flights_of_the_agent_draw_and_cut_in_c() -> None:
+    mesh, world = Mesh(np.asarray(jax.devices()[:2]), ("mission",)), miniature_world(CONFIG)
+    params, program = fresh_policy(CONFIG), rollouts._Program(CONFIG, AgentActor(CONFIG), rollouts.Extras())
+    begin, fly_on, _ = rollouts._lower(Place(None), program, mesh, world, params, jax.random.key(0))
+    found = [done_in_c(each) for each in (begin, fly_on)]
+    assert [any(each) for each in zip(*found, strict=True)] == DONE_IN_C
