@@ -42,14 +42,15 @@ def to_patches(image: Array, pixels: int, overlap: int = 0) -> Array:
 def signed_patches(image: Array, pixels: int, overlap: int = 0) -> tuple[Array, Array]:
     """Returns what is above 0 in images `[..., H, W]`, and how far the rest is below, each cut as by `to_patches`.
 
-    In the package's own programs `patches.c` does both at once, on CPUs with a C compiler. It takes NaN for 0.
+    NaN is taken for 0. In the package's own programs `patches.c` does both at once, on CPUs with a C compiler.
     """
     *batch, height, width = image.shape
     whole = not (overlap or height % pixels or width % pixels)
     in_c = is_own_program() and whole and image.dtype == jnp.float32 and jax.default_backend() == "cpu"
     if not in_c or not is_available():
         cut = to_patches(image, pixels, overlap)
-        return jnp.maximum(cut, 0.0), jnp.maximum(-cut, 0.0)
+        size = jnp.abs(cut)
+        return jnp.where(cut > 0, size, 0.0), jnp.where(cut < 0, size, 0.0)
     count = (height // pixels) * (width // pixels)
     shape = jax.ShapeDtypeStruct((*batch, count, pixels * pixels), jnp.float32)
     call = jax.ffi.ffi_call(TARGET, (shape, shape), vmap_method="broadcast_all")
