@@ -105,5 +105,21 @@ def _added_gradient(shared: Array, change: Array) -> tuple[Array, Array]:
     return change, (jnp.ones(rows.shape[0]) @ rows).reshape(shared.shape)
 
 
+@jax.custom_vjp
+def add_to_each(rows: Array, one: Array) -> Array:
+    """Returns `rows + one`, `[..., N, F]`, of rows `[..., N, F]` and what is added to each N of them, `[..., F]`."""
+    return rows + one[..., None, :]
+
+
+def _added_to_each(rows: Array, one: Array) -> tuple[Array, None]:
+    return add_to_each(rows, one), None
+
+
+def _added_to_each_gradient(_: None, change: Array) -> tuple[Array, Array]:
+    ones = jnp.ones((*change.shape[:-2], 1, change.shape[-2]), change.dtype)
+    return change, (ones @ change)[..., 0, :]
+
+
 shared_matmul.defvjp(_product, _product_gradient)
 add_shared.defvjp(_added, _added_gradient)
+add_to_each.defvjp(_added_to_each, _added_to_each_gradient)

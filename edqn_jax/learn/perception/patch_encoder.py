@@ -14,7 +14,7 @@ from jax import Array
 
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.perception.code import CodeHead
-from edqn_jax.learn.perception.layers import Dense, add_shared
+from edqn_jax.learn.perception.layers import Dense, add_shared, add_to_each
 from edqn_jax.learn.perception.patches import patch_places, signed_patches, to_patches
 from edqn_jax.sim.sensors.event_field import EventField, in_units
 
@@ -67,8 +67,7 @@ class PatchEncoder(nn.Module):
         # A layer over patch, place and motion together; what all patches or all fields share is computed once.
         place = patch_places(self.height, self.width, self.config.patch_pixels)
         z = add_shared(z, Dense(first, use_bias=False, name="place")(jnp.asarray(place)))
-        z += Dense(first, use_bias=False, name="motion")(motion)[..., None, :]
-        z = nn.relu(z)
+        z = nn.relu(add_to_each(z, Dense(first, use_bias=False, name="motion")(motion)))
         for number, size in enumerate(later, start=1):
             z = nn.relu(Dense(size, name=f"patch_{number}")(z))
         z = jnp.concatenate([z.reshape(*z.shape[:-2], -1), motion], axis=-1)
