@@ -1,6 +1,6 @@
 """The Q-network: stacked observations in, one value per move out; `agent.network` may name one of your own.
 
-Also what its learners share: its optimiser, and moving averages of parameters.
+Also the optimiser that its learners share.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from jax import Array
 from edqn_jax.config import NETWORKS, AgentConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.perception.layers import Dense, init_params
+from edqn_jax.native.adam import Adam
 from edqn_jax.sim.actions import ACTIONS
 
 Params = Any
@@ -86,17 +87,7 @@ def greedy_moves(config: AgentConfig, params: Params, memory: Array) -> Array:
     return jnp.argmax(network_values(config, params, memory), axis=-1).astype(jnp.int32)
 
 
-def make_optimiser(config: AgentConfig, updates: int) -> optax.GradientTransformation:
+def make_optimiser(config: AgentConfig, updates: int) -> Adam:
     """Returns Adam with a clipped global norm and a step size that falls linearly over `updates`."""
     rate = optax.linear_schedule(config.learning_rate, config.final_learning_rate, max(updates, 1))
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate)))
-
-
-def skip_nonfinite(optimiser: optax.GradientTransformation) -> optax.GradientTransformation:
-    """Returns an optimiser that changes nothing where a gradient is not finite, however often."""
-    return optax.apply_if_finite(optimiser, max_consecutive_errors=2**31 - 1)
-
-
-def polyak_update(new: Params, old: Params, rate: float) -> Params:
-    """Returns old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
-    return optax.incremental_update(new, old, rate)
+    return Adam(rate, config.max_gradient_norm)

@@ -10,12 +10,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
-from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.keys import split_each
@@ -24,9 +22,10 @@ from edqn_jax.learn.actor import PolicyParams, grow_moves
 from edqn_jax.learn.learner import VAE_METRICS, Metrics, State, UpdateStats, learner_of
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Policy
-from edqn_jax.learn.qnetwork import Params, skip_nonfinite
+from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.schedule import Schedule
+from edqn_jax.native.adam import Adam
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.native.products import in_precision
 from edqn_jax.sim.sensors.sensor import sensor_of
@@ -50,7 +49,7 @@ def init_networks(config: Config, key: Array) -> Networks:
     vae, learner = embedding.init_params(config, vae_key), learner_of(config)
     return Networks(
         vae=vae,
-        vae_optimiser=_vae_optimiser(config.encoder.learning_rate).init(ravel_pytree(vae)[0]) if vae else None,
+        vae_optimiser=Adam(config.encoder.learning_rate).init(ravel_pytree(vae)[0]) if vae else None,
         encoder=embedding.inference_params(config, vae),
         agent=learner.init(config, agent_key),
         teacher=None if learner.teacher is None else jax.tree.map(jnp.asarray, learner.teacher(config).params),
@@ -103,11 +102,6 @@ def check_begins(config: Config, policy: Policy) -> None:
     jax.eval_shape(begin, jax.random.key(0))
 
 
-def _vae_optimiser(rate: Array | float) -> optax.GradientTransformation:
-    """Returns Adam of a step size [], for parameters as one vector."""
-    return skip_nonfinite(optax.adam(rate))
-
-
 def update_vae(
     config: Config, axis: str | None, networks: Networks, rings: Samples | None, keys: Array, step: Array
 ) -> tuple[UpdateStats, Networks]:
@@ -148,9 +142,8 @@ def update_vae(
         gradient, parts = jax.grad(loss, has_aux=True)(params, batch, noise)
         found = gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)
         gradient, parts = all_sum(found, axis, after=0.0)
-        change, optimiser = _vae_optimiser(rate).update(gradient, optimiser, params)
-        state = optax.apply_updates(params, change), optimiser
-        return state, (parts.reconstruction, parts.kl, is_finite(gradient))
+        new = Adam(rate).step(gradient, optimiser, params)
+        return (new.params, new.state), (parts.reconstruction, parts.kl, new.finite)
 
     in_training, otherwise = config.encoder.warmup_updates_per_step, int(config.encoder.keep_learning)
     count = jnp.where(schedule.trains_vae(step), in_training, otherwise)

@@ -26,6 +26,7 @@ COMPILER = "compiler.txt"
 """In this folder: name and version of what compiled the library."""
 
 SOURCES = (
+    "native/adam.c",
     "native/all_sum.c",
     "learn/perception/patches.c",
     "native/products.c",

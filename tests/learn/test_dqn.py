@@ -93,7 +93,7 @@ def test_a_double_batch_by_hand():
 
 def test_polyak_moves_by_its_rate():
     old, new = {"a": jnp.array([0.0, 8.0])}, {"a": jnp.array([4.0, 0.0])}
-    np.testing.assert_allclose(qnetwork.polyak_update(new, old, 0.25)["a"], [1.0, 6.0])
+    np.testing.assert_allclose(polyak_update(new, old, 0.25)["a"], [1.0, 6.0])
 
 
 @pytest.mark.slow

@@ -9,12 +9,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
-from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import qnetwork, replay
@@ -22,8 +20,9 @@ from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.losses import batch_loss
 from edqn_jax.learn.exploration import epsilon_greedy_moves
 from edqn_jax.learn.learner import Learner, Rings, UpdateStats
-from edqn_jax.learn.qnetwork import Params, make_optimiser, polyak_update, skip_nonfinite
+from edqn_jax.learn.qnetwork import Params, make_optimiser
 from edqn_jax.learn.schedule import Schedule
+from edqn_jax.native.adam import Adam
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.native.products import in_precision
 from edqn_jax.sim.actions import ACTIONS
@@ -53,11 +52,9 @@ def begin_from(config: Config, state: DqnState, params: Params) -> DqnState:
     return dataclasses.replace(state, q=params, target=params, average=params)
 
 
-def _optimiser(config: Config) -> optax.GradientTransformation:
+def _optimiser(config: Config) -> Adam:
     schedule = Schedule.from_config(config)
-    return skip_nonfinite(
-        make_optimiser(config.agent, (schedule.scheduled - schedule.learn_from) * config.agent.updates_per_step)
-    )
+    return make_optimiser(config.agent, (schedule.scheduled - schedule.learn_from) * config.agent.updates_per_step)
 
 
 def count_rows_before_updates(config: Config) -> int:
@@ -93,22 +90,12 @@ def update_q(
         batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
         (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(state.q, state.target, batch)
         gradient, total, count, sum_q = all_sum((gradient, total, count, sum_q), axis, after)
-        gradient = gradient * (1.0 / jnp.maximum(count, 1.0))  # a quotient for each number takes longer on CPUs
-        change, optimiser = _optimiser(config).update(gradient, state.q_optimiser, state.q)
-        q, finite = optax.apply_updates(state.q, change), is_finite(gradient)
-
-        def follow(old: Array, rate: float) -> Array:
-            """Follows `q`, unless it may be `q` that is not finite."""
-            return jnp.where(finite, polyak_update(q, old, rate), old)
-
-        state = DqnState(
-            q=q,
-            q_optimiser=optimiser,
-            target=follow(state.target, agent.target_rate),
-            average=follow(state.average, agent.average_rate),
-        )
         count = jnp.maximum(count, 1.0)
-        return state, (total / count, sum_q / count, finite)
+        averages = (state.target, agent.target_rate), (state.average, agent.average_rate)
+        new = _optimiser(config).step(gradient, state.q_optimiser, state.q, averages, scale=1.0 / count)
+        target, average = new.averages
+        state = DqnState(q=new.params, target=target, average=average, q_optimiser=new.state)
+        return state, (total / count, sum_q / count, new.finite)
 
     def learn(state: DqnState):
         many = split_each(rings.keys, agent.updates_per_step)

@@ -12,11 +12,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jax import Array, lax
 
-from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.config.learning import ImitationConfig
 from edqn_jax.keys import split_each
@@ -25,8 +23,9 @@ from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.learner import count_rows_before_updates, count_updates
 from edqn_jax.learn.dqn.losses import value_of
 from edqn_jax.learn.learner import Exploration, Learner, Metrics, Rings, Teacher, UpdateStats
-from edqn_jax.learn.qnetwork import Params, make_optimiser, network_values, polyak_update, skip_nonfinite
+from edqn_jax.learn.qnetwork import Params, make_optimiser, network_values
 from edqn_jax.learn.schedule import Schedule
+from edqn_jax.native.adam import Adam
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.native.products import in_precision
 from edqn_jax.sim.actions import ACTIONS
@@ -55,10 +54,10 @@ def begin_from(config: Config, state: StudentState, params: Params) -> StudentSt
     return dataclasses.replace(state, q=params, average=params)
 
 
-def _optimiser(config: Config) -> optax.GradientTransformation:
+def _optimiser(config: Config) -> Adam:
     schedule = Schedule.from_config(config)
     updates = (schedule.scheduled - schedule.learn_from) * config.agent.updates_per_step
-    return skip_nonfinite(make_optimiser(config.agent, updates))
+    return make_optimiser(config.agent, updates)
 
 
 def teacher_share(config: ImitationConfig, decisions: Array, total: int) -> Array:
@@ -122,12 +121,10 @@ def update_student(
         (total, (count, agrees)), gradient = jax.value_and_grad(loss, has_aux=True)(state.q, batch)
         gradient, total, count, agrees = all_sum((gradient, total, count, agrees), axis, after)
         count = jnp.maximum(count, 1.0)
-        gradient = jax.tree.map(lambda x: x / count, gradient)
-        change, optimiser = _optimiser(config).update(gradient, state.optimiser, state.q)
-        q, finite = optax.apply_updates(state.q, change), is_finite(gradient)
-        followed = polyak_update(q, state.average, agent.average_rate)
-        average = jax.tree.map(lambda new, old: jnp.where(finite, new, old), followed, state.average)
-        return StudentState(q=q, average=average, optimiser=optimiser), (total / count, agrees / count, finite)
+        averages = ((state.average, agent.average_rate),)
+        new = _optimiser(config).step(gradient, state.optimiser, state.q, averages, scale=1.0 / count)
+        state = StudentState(q=new.params, average=new.averages[0], optimiser=new.state)
+        return state, (total / count, agrees / count, new.finite)
 
     def learn(state: StudentState):
         state, (loss, agreement, finite) = lax.scan(update, state, split_each(rings.keys, agent.updates_per_step))

@@ -12,11 +12,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jax import Array, lax
 
-from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import qnetwork
@@ -25,8 +23,9 @@ from edqn_jax.learn.dqn.losses import td_loss, value_of
 from edqn_jax.learn.exploration import epsilon_greedy_moves
 from edqn_jax.learn.learner import Learner, Rings, UpdateStats
 from edqn_jax.learn.pqn.returns import Rollout, lambda_returns, rollout_of
-from edqn_jax.learn.qnetwork import Params, make_optimiser, network_values, polyak_update, skip_nonfinite
+from edqn_jax.learn.qnetwork import Params, make_optimiser, network_values
 from edqn_jax.learn.schedule import Schedule
+from edqn_jax.native.adam import Adam
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.native.products import in_precision
 from edqn_jax.sim.actions import ACTIONS
@@ -64,10 +63,10 @@ def begin_from(config: Config, state: PqnState, params: Params) -> PqnState:
     return dataclasses.replace(state, q=params, average=params)
 
 
-def _optimiser(config: Config) -> optax.GradientTransformation:
+def _optimiser(config: Config) -> Adam:
     schedule, pqn = Schedule.from_config(config), config.pqn
     rollouts = (schedule.scheduled - schedule.warmup) // pqn.rollout
-    return skip_nonfinite(make_optimiser(config.agent, rollouts * pqn.epochs * pqn.minibatches))
+    return make_optimiser(config.agent, rollouts * pqn.epochs * pqn.minibatches)
 
 
 def count_rows_before_updates(config: Config) -> int:
@@ -112,12 +111,10 @@ def update_q(
         (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(state.q, batch)
         gradient, total, count, sum_q = all_sum((gradient, total, count, sum_q), axis, after)
         count = jnp.maximum(count, 1.0)
-        gradient = jax.tree.map(lambda x: x / count, gradient)
-        change, optimiser = _optimiser(config).update(gradient, state.q_optimiser, state.q)
-        q, finite = optax.apply_updates(state.q, change), is_finite(gradient)
-        followed = polyak_update(q, state.average, pqn.average_rate)
-        average = jax.tree.map(lambda new, old: jnp.where(finite, new, old), followed, state.average)
-        return PqnState(q=q, average=average, q_optimiser=optimiser), (total / count, sum_q / count, finite)
+        averages = ((state.average, pqn.average_rate),)
+        new = _optimiser(config).step(gradient, state.q_optimiser, state.q, averages, scale=1.0 / count)
+        state = PqnState(q=new.params, average=new.averages[0], q_optimiser=new.state)
+        return state, (total / count, sum_q / count, new.finite)
 
     def learn(state: PqnState):
         take = partial(rollout_of, time=rings.time, decisions=pqn.rollout, history=agent.history)
