@@ -46,6 +46,20 @@ class Dense(nn.Module):
         return add_shared(y, bias) if self.many_rows else y + bias
 
 
+class Weights(nn.Module):
+    """The parameters of a linear layer `Dense`, for those who multiply by several at once."""
+
+    features: int
+    use_bias: bool = True
+
+    @nn.compact
+    def __call__(self, inputs: int) -> tuple[Array, Array]:
+        """Returns kernel `[K, F]` and bias `[F]`, 0 without one, for K inputs."""
+        kernel = self.param("kernel", lecun_normal(), (inputs, self.features))
+        bias = self.param("bias", zeros, (self.features,)) if self.use_bias else jnp.zeros(self.features)
+        return kernel, bias
+
+
 def init_params(module: Any, name: str, key: Array, **inputs: Any) -> Any:
     """Returns fresh parameters of a module for such inputs, which are given by their place.
 

@@ -14,14 +14,15 @@ from jax import Array
 
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.perception.code import CodeHead
-from edqn_jax.learn.perception.layers import Dense, add_shared, add_to_each
+from edqn_jax.learn.perception.layers import Dense, Weights, add_shared, add_to_each, matmul
 from edqn_jax.learn.perception.patches import patch_places, signed_patches, to_patches
 from edqn_jax.sim.sensors.event_field import EventField, in_units
 
 
 def log_counts(field: EventField, pixels: int, overlap: int = 0) -> list[Array]:
-    """Returns log(1 + count) of ON and of OFF events, of each pair of frames, in patches: 2 F arrays [..., N, K].
+    """Returns log(1 + count) of ON and of OFF events, of each pair of frames, in patches: arrays [..., N, *].
 
+    Joined, they are [..., N, 2 F K], see `signed_patches`.
     With noise, a pixel's ON and OFF events between two frames stand in rows of their own.
 
     Args:
@@ -58,12 +59,18 @@ class PatchEncoder(nn.Module):
         else:
             channels = [to_patches(image, *size) for image in jnp.moveaxis(sensed, -3, 0)]
         first, *later = self.config.patch_layers
-        # One product for each channel: joined to one array first, they take twice as long on a CPU.
-        products = [
-            Dense(first, use_bias=number == 0, name=f"channel_{number}")(channel)
-            for number, channel in enumerate(channels)
+        # One product for each array of channels: joined to one here, they would take twice as long on a CPU.
+        pixels = (self.config.patch_pixels + 2 * self.config.patch_overlap) ** 2
+        weights = [
+            Weights(first, use_bias=number == 0, name=f"channel_{number}")(pixels)
+            for number in range(sum(channel.shape[-1] for channel in channels) // pixels)
         ]
-        z = sum(products[1:], products[0])
+        products, kernels = [], [kernel for kernel, _ in weights]
+        for channel in channels:
+            count = channel.shape[-1] // pixels
+            products.append(matmul(channel, jnp.concatenate(kernels[:count]) if count > 1 else kernels[0]))
+            kernels = kernels[count:]
+        z = add_shared(sum(products[1:], products[0]), weights[0][1])
         # A layer over patch, place and motion together; what all patches or all fields share is computed once.
         place = patch_places(self.height, self.width, self.config.patch_pixels)
         z = add_shared(z, Dense(first, use_bias=False, name="place")(jnp.asarray(place)))

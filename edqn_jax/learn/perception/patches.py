@@ -39,8 +39,10 @@ def to_patches(image: Array, pixels: int, overlap: int = 0) -> Array:
     return cut.reshape(*batch, rows * columns, pixels * pixels)
 
 
-def signed_patches(image: Array, pixels: int, overlap: int = 0) -> tuple[Array, Array]:
+def signed_patches(image: Array, pixels: int, overlap: int = 0) -> list[Array]:
     """Returns what is above 0 in images `[..., H, W]`, and how far the rest is below, each cut as by `to_patches`.
+
+    They are one array `[..., N, 2 K]`, where they can be cut at once, or two `[..., N, K]`.
 
     What becomes of NaN is left open. In the package's own programs `patches.c` does both at once, on CPUs with a C
     compiler.
@@ -51,12 +53,10 @@ def signed_patches(image: Array, pixels: int, overlap: int = 0) -> tuple[Array, 
     if not in_c or not is_available():
         cut = to_patches(image, pixels, overlap)
         size = jnp.abs(cut)
-        return jnp.where(cut > 0, size, 0.0), jnp.where(cut < 0, size, 0.0)
+        return [jnp.where(cut > 0, size, 0.0), jnp.where(cut < 0, size, 0.0)]
     count = (height // pixels) * (width // pixels)
-    shape = jax.ShapeDtypeStruct((*batch, count, pixels * pixels), jnp.float32)
-    call = jax.ffi.ffi_call(TARGET, (shape, shape), vmap_method="broadcast_all")
-    above, below = call(image, jnp.int32(pixels))
-    return above, below
+    shape = jax.ShapeDtypeStruct((*batch, count, 2 * pixels * pixels), jnp.float32)
+    return [jax.ffi.ffi_call(TARGET, shape, vmap_method="broadcast_all")(image, jnp.int32(pixels))]
 
 
 def is_available() -> bool:
