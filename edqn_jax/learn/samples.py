@@ -170,6 +170,6 @@ def _counts_alone(config: EncoderConfig, field: EventField) -> bool:
 
 
 def target_of(config: EncoderConfig, observation: Observation, nearness: Array | None) -> Target:
-    """Returns the decoder's target for observations, without a unit, see `vae.decoder_target`."""
+    """Returns the decoder's target for observations, without a unit, see `vae.target_in_waves`."""
     assert isinstance(observation.sensed, EventField | Array)
-    return vae.in_waves(config, vae.decoder_target(config, observation.sensed, nearness))
+    return vae.target_in_waves(config, observation.sensed, nearness)

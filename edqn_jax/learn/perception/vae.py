@@ -97,18 +97,27 @@ def decoder_target(config: EncoderConfig, sensed: EventField | Array, nearness: 
         sensed: field `[..., F, H, W]` or pictures `[..., C, H, W]`.
         nearness: `[..., H, W]` as the sensor `depth` shows it; needed unless the target is `sensed`.
     """
+    image = _sharp_target(config, sensed, nearness)
+    if config.target_blur == 0:
+        return image
+    height, width = image.shape[-2:]
+    return jnp.asarray(_blur(height, config.target_blur)) @ (image @ jnp.asarray(_blur(width, config.target_blur).T))
+
+
+def target_in_waves(config: EncoderConfig, sensed: EventField | Array, nearness: Array | None = None) -> Target:
+    """Returns `decoder_target` in the standing waves that the decoder draws."""
+    return in_waves(config, _sharp_target(config, sensed, nearness), config.target_blur)
+
+
+def _sharp_target(config: EncoderConfig, sensed: EventField | Array, nearness: Array | None) -> Array:
+    """Returns `decoder_target` before it is blurred."""
     channels = []
     if config.target != "nearness":
         channels.append(_input_channels(sensed))
     if needs_nearness(config):
         assert nearness is not None, "this target needs the label"
         channels.append(nearness[..., None, :, :])
-    image = jnp.concatenate(channels, axis=-3)
-    if config.target_blur == 0:
-        return image
-    height, width = image.shape[-2:]
-    # Along rows first: XLA transposes what is multiplied from the left, and with it would compute the label in columns.
-    return jnp.asarray(_blur(height, config.target_blur)) @ (image @ jnp.asarray(_blur(width, config.target_blur).T))
+    return jnp.concatenate(channels, axis=-3)
 
 
 def _input_channels(sensed: EventField | Array) -> Array:
@@ -129,14 +138,23 @@ def _blur(size: int, times: int) -> np.ndarray:
     return np.linalg.matrix_power(once, times).astype(np.float32)
 
 
-def in_waves(config: EncoderConfig, image: Array) -> Target:
-    """Returns a target `[..., channels, H, W]` in the standing waves that the decoder draws."""
+def in_waves(config: EncoderConfig, image: Array, blur: int = 0) -> Target:
+    """Returns a target `[..., channels, H, W]`, blurred so many times, in the standing waves that the decoder draws.
+
+    The blur's kernel, with edges repeated, leaves a wave k of N pixels a wave, (1 + cos(pi k / N)) / 2 as large.
+    """
     height, width = image.shape[-2:]
     rows, columns = _output_size(config, height, width)
-    amplitudes = jnp.asarray(cosine_basis(height, rows)) @ image @ jnp.asarray(cosine_basis(width, columns).T)
+    down, across = (
+        jnp.asarray(cosine_basis(size, size) * (0.5 + 0.5 * np.cos(np.pi * np.arange(size) / size))[:, None] ** blur)
+        for size in (height, width)
+    )
+    # Along rows first: XLA transposes what is multiplied from the left, and with it would compute the label in columns.
+    waves = down.astype(jnp.float32) @ (image @ across.astype(jnp.float32).T)
+    amplitudes = waves[..., :rows, :columns]
     # The waves are orthonormal, so squares add up over them as over pixels.
     axes = (-3, -2, -1)
-    beyond = jnp.sum(jnp.square(image), axis=axes) - jnp.sum(jnp.square(amplitudes), axis=axes)
+    beyond = jnp.sum(jnp.square(waves), axis=axes) - jnp.sum(jnp.square(amplitudes), axis=axes)
     return Target(amplitudes, beyond)
 
 
