@@ -15,25 +15,25 @@ from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.perception import patches
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.native import threefry
+from edqn_jax.native import adam, threefry
 from tests.support.configs import TINY
 from tests.support.miniature import miniature_world
 
 CONFIG = dataclasses.replace(TINY, camera=dataclasses.replace(TINY.camera, width=8, height=8))
 """Images that can be cut into whole patches."""
 
-DONE_IN_C = [shutil.which("cc") is not None] * 2
+HAS_COMPILER = shutil.which("cc") is not None
 
 
 def done_in_c(program: jax.stages.Lowered) -> list[bool]:
-    """Returns whether a program draws its random bits in C, and cuts its patches."""
-    return [f"@{target}" in program.as_text() for target in (threefry.TARGET, patches.TARGET)]
+    """Returns whether a program draws its random bits in C, cuts its patches, and takes steps of its optimisers."""
+    return [f"@{target}" in program.as_text() for target in (threefry.TARGET, patches.TARGET, adam.TARGET)]
 
 
-def test_training_draws_and_cuts_in_c() -> None:
+def test_training_draws_cuts_and_steps_in_c() -> None:
     trainer = Trainer(CONFIG, miniature_world(CONFIG), jax.devices()[:2])
     trainer.trace()
-    assert trainer._traced is not None and done_in_c(trainer._traced) == DONE_IN_C
+    assert trainer._traced is not None and done_in_c(trainer._traced) == [HAS_COMPILER] * 3
 
 
 def test_flights_of_the_agent_draw_and_cut_in_c() -> None:
@@ -41,4 +41,4 @@ def test_flights_of_the_agent_draw_and_cut_in_c() -> None:
     params, program = fresh_policy(CONFIG), rollouts._Program(CONFIG, AgentActor(CONFIG), rollouts.Extras())
     begin, fly_on, _ = rollouts._lower(Place(None), program, mesh, world, params, jax.random.key(0))
     found = [done_in_c(each) for each in (begin, fly_on)]
-    assert [any(each) for each in zip(*found, strict=True)] == DONE_IN_C
+    assert [any(each) for each in zip(*found, strict=True)] == [HAS_COMPILER, HAS_COMPILER, False]

@@ -249,6 +249,18 @@ def test_the_target_keeps_polarities_apart_and_compresses_counts():
     np.testing.assert_allclose(blurred[0, 2, 3], sharp[0, 2, 3] / 4.0, rtol=1e-5)
 
 
+@pytest.mark.parametrize("times", [0, 1, 3])
+def test_a_blurred_target_in_waves_is_that_of_the_blurred_image(times: int) -> None:
+    config = dataclasses.replace(CONFIG, target_blur=times)
+    image = jax.random.uniform(jax.random.key(0), (2, 1, 12, 16))
+    found, wanted = vae.target_in_waves(config, image), vae.in_waves(config, vae.decoder_target(config, image))
+    np.testing.assert_allclose(found.amplitudes, wanted.amplitudes, atol=1e-5)  # amplitudes of up to 10
+    # A difference of sums of up to 100.
+    np.testing.assert_allclose(found.beyond, wanted.beyond, atol=1e-4)
+    squares = jnp.sum(jnp.square(found.amplitudes), axis=(1, 2, 3)) + found.beyond
+    np.testing.assert_allclose(squares, jnp.sum(vae.decoder_target(config, image) ** 2, axis=(1, 2, 3)), rtol=1e-5)
+
+
 @pytest.fixture(scope="module")
 def trained():
     """Parameters before and after training on moving boxes, and unseen windows."""

@@ -38,3 +38,21 @@ def test_what_is_added_to_all_rows_collects_the_gradients_of_all() -> None:
     of_x, of_shared = jax.grad(lambda x, s: jnp.sum(weight * layers.add_shared(x, s)), argnums=(0, 1))(x, shared)
     np.testing.assert_array_equal(of_x, weight)
     np.testing.assert_array_equal(of_shared, weight.sum(axis=(0, 1)))
+
+
+def test_weights_are_the_parameters_of_a_layer() -> None:
+    x, key = jnp.ones((2, 7)), jax.random.key(0)
+    wanted = layers.Dense(3).init(key, x)
+    assert jax.tree.all(jax.tree.map(np.array_equal, layers.Weights(3).init(key, 7), wanted))
+    kernel, bias = layers.Weights(3, use_bias=False).apply({"params": {"kernel": jnp.ones((7, 3))}}, 7)
+    np.testing.assert_array_equal(kernel, np.ones((7, 3)))
+    np.testing.assert_array_equal(bias, np.zeros(3))
+
+
+def test_what_is_added_to_each_row_of_an_image_collects_the_gradients_of_its_rows() -> None:
+    rows, one = jnp.arange(24.0).reshape(2, 4, 3), jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    np.testing.assert_array_equal(layers.add_to_each(rows, one), rows + one[:, None])
+    weight = jnp.arange(24.0).reshape(rows.shape)
+    of_rows, of_one = jax.grad(lambda r, o: jnp.sum(weight * layers.add_to_each(r, o)), argnums=(0, 1))(rows, one)
+    np.testing.assert_array_equal(of_rows, weight)
+    np.testing.assert_array_equal(of_one, weight.sum(axis=1))
