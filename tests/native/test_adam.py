@@ -20,7 +20,7 @@ RATES = 0.25, 0.01
 """Of the averages that follow."""
 
 
-def in_optax(rate: Any, most_norm: float | None, gradients: list[Array], params: Array) -> tuple[Any, ...]:
+def in_optax(rate: Any, most_norm: float | None, gradients: list[Array], params: Any) -> tuple[Any, ...]:
     """Returns parameters, both averages and moments after steps of `optax.adam`, as its users write them."""
     adam = optax.adam(rate)
     if most_norm is not None:
