@@ -1,4 +1,4 @@
-/* A step of Adam (Kingma & Ba 2015) on one vector of parameters, for CPUs: a handler of XLA's foreign function
+/* A step of Adam (Kingma & Ba 2015) on vectors of parameters, for CPUs: a handler of XLA's foreign function
  * interface (`adam.py` registers it).
  *
  * XLA passes over the numbers a dozen times, here it is twice: once for the gradient's norm, and once for the rest, in
@@ -17,7 +17,10 @@
 /* Of the first operand, in the order of `adam.py`; after them the rate of each follower. */
 enum { SCALE, MOST_NORM, STEP, FIRST_DECAY, SECOND_DECAY, SECOND_CORRECTION, TINY, FOLLOWER_RATES };
 
-enum { GRADIENT = 1, PARAMETERS, FIRST_MOMENT, SECOND_MOMENT, FOLLOWERS };
+enum { GRADIENT = 1, PARAMETERS }; /* operands; from PARAMETERS on they are changed */
+
+#define FIRST_FOLLOWER 3 /* of what is changed, after parameters and both moments */
+#define MOST_CHANGED (FIRST_FOLLOWER + 8)
 
 static float* operand(const XLA_FFI_CallFrame* call, int i) { return ((XLA_FFI_Buffer*)call->args.args[i])->data; }
 static float* result(const XLA_FFI_CallFrame* call, int i) { return ((XLA_FFI_Buffer*)call->rets.rets[i])->data; }
@@ -71,27 +74,42 @@ static void follow(float rate, int64_t count, const float* restrict parameters, 
   for (int64_t k = 0; k < count; ++k) follower[k] = rate * parameters[k] + (1.0f - rate) * follower[k];
 }
 
-XLA_FFI_Error* edqn_adam(XLA_FFI_CallFrame* call) {
-  if (asked_for_version(call)) return 0;
-  const float *numbers = operand(call, 0), *gradient = operand(call, GRADIENT);
-  const int64_t count = ((const XLA_FFI_Buffer*)call->args.args[GRADIENT])->dims[0];
-  const int changed = (int)call->args.size - PARAMETERS; /* results before the last, of the operands from there on */
-  for (int i = 0; i < changed; ++i)
-    if (result(call, i) != operand(call, PARAMETERS + i))
-      memcpy(result(call, i), operand(call, PARAMETERS + i), count * sizeof(float));
+/* Steps along one gradient. `changed`: parameters, moments and followers, in place. Returns whether it was finite. */
+static int step_all(const float* numbers, const float* gradient, int64_t count, float* const* changed, int followers) {
   float squares;
-  const int finite = measure(gradient, count, &squares);
-  *(uint8_t*)((XLA_FFI_Buffer*)call->rets.rets[changed])->data = (uint8_t)finite;
-  if (!finite) return 0;
+  if (!measure(gradient, count, &squares)) return 0;
   float scale = numbers[SCALE];
   const float norm = sqrtf(squares) * scale;
   if (numbers[MOST_NORM] > 0.0f && norm >= numbers[MOST_NORM]) scale *= numbers[MOST_NORM] / norm;
   for (int64_t from = 0; from < count; from += BLOCK) {
     const int64_t size = count - from < BLOCK ? count - from : BLOCK;
-    float* parameters = result(call, 0) + from;
-    step(numbers, scale, size, gradient + from, parameters, result(call, 1) + from, result(call, 2) + from);
-    for (int i = FOLLOWERS; i < changed + PARAMETERS; ++i)
-      follow(numbers[FOLLOWER_RATES + i - FOLLOWERS], size, parameters, result(call, i - PARAMETERS) + from);
+    float* parameters = changed[0] + from;
+    step(numbers, scale, size, gradient + from, parameters, changed[1] + from, changed[2] + from);
+    for (int i = 0; i < followers; ++i)
+      follow(numbers[FOLLOWER_RATES + i], size, parameters, changed[FIRST_FOLLOWER + i] + from);
+  }
+  return 1;
+}
+
+XLA_FFI_Error* edqn_adam(XLA_FFI_CallFrame* call) {
+  if (asked_for_version(call)) return 0;
+  const XLA_FFI_Buffer *given = call->args.args[0], *gradients = call->args.args[GRADIENT];
+  const int64_t amount = given->dims[given->rank - 1], count = gradients->dims[gradients->rank - 1];
+  int64_t vectors = 1;
+  for (int i = 0; i < gradients->rank - 1; ++i) vectors *= gradients->dims[i];
+  const int all = (int)call->rets.size - 1; /* that are changed; whether gradients were finite comes last */
+  if (all > MOST_CHANGED) return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "adam.c moves at most 8 averages");
+  float* changed[MOST_CHANGED];
+  for (int i = 0; i < all; ++i) {
+    changed[i] = result(call, i);
+    if (changed[i] != operand(call, PARAMETERS + i))
+      memcpy(changed[i], operand(call, PARAMETERS + i), vectors * count * sizeof(float));
+  }
+  uint8_t* finite = ((XLA_FFI_Buffer*)call->rets.rets[all])->data;
+  for (int64_t vector = 0; vector < vectors; ++vector) {
+    finite[vector] = (uint8_t)step_all(operand(call, 0) + vector * amount, operand(call, GRADIENT) + vector * count,
+                                       count, changed, all - FIRST_FOLLOWER);
+    for (int i = 0; i < all; ++i) changed[i] += count;
   }
   return 0;
 }

@@ -98,7 +98,7 @@ class Adam:
         call = jax.ffi.ffi_call(
             TARGET,
             (*shapes, jax.ShapeDtypeStruct((), jnp.bool_)),
-            vmap_method="sequential",
+            vmap_method="broadcast_all",
             input_output_aliases={2 + number: number for number in range(len(changed))},
         )
         packed = jnp.stack([jnp.asarray(number, jnp.float32) for number in numbers])

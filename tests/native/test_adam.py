@@ -105,14 +105,23 @@ def test_what_a_step_begins_with_is_not_lost() -> None:
 
 
 def test_of_many_vectors_each_takes_its_step() -> None:
-    params, adam = jnp.asarray(np.random.default_rng(1).normal(size=(3, 40)), jnp.float32), Adam(0.1, 1.0)
+    rng = np.random.default_rng(1)
+    params, gradients = (jnp.asarray(rng.normal(size=(3, 600)), jnp.float32) for _ in range(2))
+    gradients, adam = gradients.at[1, 5].set(jnp.nan), Adam(0.1, 1.0)
 
-    def step(params: Array) -> Array:
-        return adam.step(params, adam.init(params), params).params
+    def step(gradient: Array, params: Array) -> Stepped:
+        return adam.step(gradient, adam.init(params), params, ((jnp.zeros(600), 0.25), (params, 0.5)))
 
     with own_program():
-        found = jax.jit(jax.vmap(step))(params)
-    np.testing.assert_allclose(found, jnp.stack([step(each) for each in params]), rtol=1e-5, atol=2e-6)
+        found = jax.jit(jax.vmap(step))(gradients, params)
+    np.testing.assert_array_equal(found.finite, [True, False, True])
+    for number in range(3):
+        wanted = step(gradients[number], params[number])
+        jax.tree.map(
+            lambda ours, theirs: np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=2e-6),
+            jax.tree.map(lambda x: x[number], found),  # noqa: B023
+            wanted,
+        )
 
 
 def test_only_vectors_in_programs_of_ours_are_stepped_in_c() -> None:
