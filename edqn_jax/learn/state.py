@@ -75,7 +75,7 @@ class Health:
     observation: Array
     reward: Array
     parameters: Array
-    """1 if a number of any network was not finite before the updates."""
+    """1 if a number of the VAE or of the learner's network was not finite before the updates."""
     loss: Array
     """Updates."""
     gradient: Array

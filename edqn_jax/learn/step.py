@@ -69,7 +69,8 @@ def train_step(
     env_state, timestep = _fly(config, env_params, actors, action)
     near = None if actors.advice is None else _nearness(config, env_params, env_state)
     rings = _store_samples(config, env_params, actors, env_state, timestep, step, near)
-    # The acting encoder is a copy of the VAE's. Each alone, since the VAE's parameters are joined for its update, too.
+    # The acting encoder is made from the VAE. Each network alone: the VAE's update joins its parameters in any case,
+    # which XLA does once for both.
     params_nonfinite = ~(is_finite(networks.vae) & is_finite(learner_of(config).network(networks.agent)))
     of_vae, networks = update_vae(config, axis, networks, rings, keys.vae, step)
     last = of_vae.metrics["reconstruction_loss"]

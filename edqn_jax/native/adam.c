@@ -2,7 +2,7 @@
  * interface (`adam.py` registers it).
  *
  * XLA passes over the numbers a dozen times, here it is twice: once for the gradient's norm, and once for the rest, in
- * blocks that stay in the innermost cache. Results are in the place of their operands.
+ * blocks that stay in the innermost cache. XLA gives results the memory of their operands.
  */
 
 #include <math.h>
@@ -28,7 +28,7 @@ static float* result(const XLA_FFI_CallFrame* call, int i) { return ((XLA_FFI_Bu
 /* Returns whether all numbers are finite, and gives the sum of their squares. */
 static int measure(const float* restrict x, int64_t count, float* restrict squares) {
   float sums[LANES] = {0};
-  int32_t largest[LANES] = {0}; /* exponents and fractions: as numbers, compilers take all for finite */
+  int32_t largest[LANES] = {0}; /* bits without the sign, since compilers may take it that floats are finite */
   int64_t k = 0;
   for (; k + LANES <= count; k += LANES)
     for (int lane = 0; lane < LANES; ++lane) {
@@ -80,7 +80,7 @@ static int step_all(const float* numbers, const float* gradient, int64_t count, 
   if (!measure(gradient, count, &squares)) return 0;
   float scale = numbers[SCALE];
   const float norm = sqrtf(squares) * scale;
-  if (numbers[MOST_NORM] > 0.0f && norm >= numbers[MOST_NORM]) scale *= numbers[MOST_NORM] / norm;
+  if (numbers[MOST_NORM] >= 0.0f && norm >= numbers[MOST_NORM]) scale *= numbers[MOST_NORM] / norm;
   for (int64_t from = 0; from < count; from += BLOCK) {
     const int64_t size = count - from < BLOCK ? count - from : BLOCK;
     float* parameters = changed[0] + from;
@@ -103,7 +103,7 @@ XLA_FFI_Error* edqn_adam(XLA_FFI_CallFrame* call) {
   for (int i = 0; i < all; ++i) {
     changed[i] = result(call, i);
     if (changed[i] != operand(call, PARAMETERS + i))
-      memcpy(changed[i], operand(call, PARAMETERS + i), vectors * count * sizeof(float));
+      return failed(call, XLA_FFI_Error_Code_INTERNAL, "adam.c changes its operands in place, and was given copies");
   }
   uint8_t* finite = ((XLA_FFI_Buffer*)call->rets.rets[all])->data;
   for (int64_t vector = 0; vector < vectors; ++vector) {

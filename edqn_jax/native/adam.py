@@ -20,16 +20,16 @@ TARGET = "edqn_adam"
 
 FIRST_DECAY, SECOND_DECAY, TINY = 0.9, 0.999, 1e-8
 
-Params = Any
-"""A plain pytree of parameters."""
+NO_LIMIT = -1.0
+"""To C, the longest norm of gradients that are not shortened."""
 
 
 class Stepped(NamedTuple):
     """What a step leaves."""
 
-    params: Params
+    params: Any  # a plain pytree, as the next two
     state: Any  # of the optimiser
-    averages: tuple[Params, ...]
+    averages: tuple[Any, ...]
     finite: Array  # [] bool, whether the gradient was; else all the rest is as before
 
 
@@ -45,18 +45,18 @@ class Adam:
     """Step size."""
 
     most_norm: float | None = None
-    """Gradients are shortened to this norm."""
+    """Longer gradients are shortened to this norm; None leaves them as they are."""
 
-    def init(self, params: Params) -> Any:
+    def init(self, params: Any) -> Any:
         """Returns the state of an optimiser that has seen nothing."""
         return self._in_optax().init(params)
 
     def step(
         self,
-        gradient: Params,
+        gradient: Any,
         state: Any,
-        params: Params,
-        averages: tuple[tuple[Params, float], ...] = (),
+        params: Any,
+        averages: tuple[tuple[Any, float], ...] = (),
         scale: Array | float = 1.0,
     ) -> Stepped:
         """Takes a step.
@@ -65,14 +65,15 @@ class Adam:
             averages: moving averages of the parameters, and the share of the new parameters in each.
             scale: by which the gradient is multiplied first.
         """
-        is_vector = isinstance(params, Array) and params.ndim == 1 and params.dtype == jnp.float32
-        if is_own_program() and is_vector and jax.default_backend() == "cpu" and is_available():
+        arrays = jax.tree.leaves((params, gradient, [old for old, _ in averages]))
+        are_vectors = isinstance(params, Array) and all(x.ndim == 1 and x.dtype == jnp.float32 for x in arrays)
+        if is_own_program() and are_vectors and jax.default_backend() == "cpu" and is_available():
             return self._step_in_c(gradient, state, params, averages, scale)
         gradient = jax.tree.map(lambda x: x * scale, gradient)
         change, state = self._in_optax().update(gradient, state, params)
         params = optax.apply_updates(params, change)
 
-        def follow(old: Params, rate: float) -> Params:
+        def follow(old: Any, rate: float) -> Any:
             moved = polyak_update(params, old, rate)
             return jax.tree.map(lambda new, before: jnp.where(state.last_finite, new, before), moved, old)
 
@@ -92,7 +93,8 @@ class Adam:
         rate = self.rate(moments.count) if callable(self.rate) else self.rate
         first, second = (1.0 / (1.0 - decay**count) for decay in (FIRST_DECAY, SECOND_DECAY))
         rates = [rate for _, rate in averages]
-        numbers = (scale, self.most_norm or 0.0, rate * first, FIRST_DECAY, SECOND_DECAY, second, TINY, *rates)
+        most_norm = NO_LIMIT if self.most_norm is None else self.most_norm
+        numbers = (scale, most_norm, rate * first, FIRST_DECAY, SECOND_DECAY, second, TINY, *rates)
         changed = (params, moments.mu, moments.nu, *(old for old, _ in averages))
         shapes = [jax.ShapeDtypeStruct(params.shape, params.dtype)] * len(changed)
         call = jax.ffi.ffi_call(
@@ -118,7 +120,7 @@ class Adam:
         return optax.apply_if_finite(adam, max_consecutive_errors=2**31 - 1)
 
 
-def polyak_update(new: Params, old: Params, rate: float) -> Params:
+def polyak_update(new: Any, old: Any, rate: float) -> Any:
     """Returns old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
     return optax.incremental_update(new, old, rate)
 

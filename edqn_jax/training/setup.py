@@ -30,7 +30,7 @@ from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.learn.state import TrainState
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.learn.updates import check_begins
-from edqn_jax.native import all_sum, products, threefry
+from edqn_jax.native import adam, all_sum, products, threefry
 from edqn_jax.planning.astar import Path as ShortestPath
 from edqn_jax.planning.astar import kept_shortest_path
 from edqn_jax.sim.camera import native as drawing
@@ -238,6 +238,7 @@ def _load_libraries(config: Config, devices: int) -> None:
     if on_cpu:
         threefry.is_available()
         patches.is_available()
+        adam.is_available()
     if on_cpu and devices > 1 and jax.process_count() == 1:
         all_sum.is_available()
 

@@ -92,6 +92,7 @@ def test_a_double_batch_by_hand():
     assert loss == pytest.approx(0.5 * (1 + 0.9 * 30 - 1) ** 2)
 
 
+@pytest.mark.slow
 def test_dueling_heads_have_no_mean_advantage():
     config = AgentConfig(hidden=(8,), history=2, dueling=True)
     params = jax.jit(partial(qnetwork.init_q, config, 3, 5))(jax.random.key(0))

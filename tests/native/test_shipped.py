@@ -163,7 +163,7 @@ def test_all_kinds_draw_what_is_drawn_by_one_compiled_here(
     hook["compile_library"](ROOT / "edqn_jax", tmp_path)
     for kind in shipped.kinds_of_processor():
         library, named = ctypes.CDLL(str(tmp_path / shipped.library_of(kind))), f"{mount}_{kind}"
-        assert library.edqn_field_rays and library.edqn_all_sum
+        assert library.edqn_field_rays and library.edqn_all_sum and library.edqn_adam
         for target in native.TARGETS:
             jax.ffi.register_ffi_target(f"{named}_{target}", jax.ffi.pycapsule(library[target]), platform="cpu")
         monkeypatch.setattr(native, "_call", lambda target, *given, named=named: call(f"{named}_{target}", *given))

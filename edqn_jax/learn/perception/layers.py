@@ -53,11 +53,10 @@ class Weights(nn.Module):
     use_bias: bool = True
 
     @nn.compact
-    def __call__(self, inputs: int) -> tuple[Array, Array]:
-        """Returns kernel `[K, F]` and bias `[F]`, 0 without one, for K inputs."""
+    def __call__(self, inputs: int) -> list[Array]:
+        """Returns kernel `[K, F]`, and bias `[F]` if there is one, for K inputs."""
         kernel = self.param("kernel", lecun_normal(), (inputs, self.features))
-        bias = self.param("bias", zeros, (self.features,)) if self.use_bias else jnp.zeros(self.features)
-        return kernel, bias
+        return [kernel, self.param("bias", zeros, (self.features,))] if self.use_bias else [kernel]
 
 
 def init_params(module: Any, name: str, key: Array, **inputs: Any) -> Any:

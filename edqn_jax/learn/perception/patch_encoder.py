@@ -59,13 +59,13 @@ class PatchEncoder(nn.Module):
         else:
             channels = [to_patches(image, *size) for image in jnp.moveaxis(sensed, -3, 0)]
         first, *later = self.config.patch_layers
-        # One product for each array of channels: joined to one here, they would take twice as long on a CPU.
+        # One product for each array of channels: to join arrays here takes XLA longer than a product fewer saves.
         pixels = (self.config.patch_pixels + 2 * self.config.patch_overlap) ** 2
         weights = [
             Weights(first, use_bias=number == 0, name=f"channel_{number}")(pixels)
             for number in range(sum(channel.shape[-1] for channel in channels) // pixels)
         ]
-        products, kernels = [], [kernel for kernel, _ in weights]
+        products, kernels = [], [kernel for kernel, *_ in weights]
         for channel in channels:
             count = channel.shape[-1] // pixels
             products.append(matmul(channel, jnp.concatenate(kernels[:count]) if count > 1 else kernels[0]))

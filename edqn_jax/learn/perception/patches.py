@@ -42,10 +42,8 @@ def to_patches(image: Array, pixels: int, overlap: int = 0) -> Array:
 def signed_patches(image: Array, pixels: int, overlap: int = 0) -> list[Array]:
     """Returns what is above 0 in images `[..., H, W]`, and how far the rest is below, each cut as by `to_patches`.
 
-    They are one array `[..., N, 2 K]`, where they can be cut at once, or two `[..., N, K]`.
-
-    What becomes of NaN is left open. In the package's own programs `patches.c` does both at once, on CPUs with a C
-    compiler.
+    They are two arrays `[..., N, K]`, or one `[..., N, 2 K]`: in the package's own programs `patches.c` cuts whole
+    patches at once, on CPUs with a C compiler. What becomes of NaN is left open.
     """
     *batch, height, width = image.shape
     whole = not (overlap or height % pixels or width % pixels)

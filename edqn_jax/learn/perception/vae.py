@@ -139,18 +139,22 @@ def _blur(size: int, times: int) -> np.ndarray:
 
 
 def in_waves(config: EncoderConfig, image: Array, blur: int = 0) -> Target:
-    """Returns a target `[..., channels, H, W]`, blurred so many times, in the standing waves that the decoder draws.
+    """Returns a target `[..., channels, H, W]` in the standing waves that the decoder draws.
 
-    The blur's kernel, with edges repeated, leaves a wave k of N pixels a wave, (1 + cos(pi k / N)) / 2 as large.
+    Args:
+        blur: how often the target is blurred first. (1, 2, 1) / 4, with edges repeated, leaves wave k of N pixels a
+            wave, (1 + cos(pi k / N)) / 2 times as large.
     """
     height, width = image.shape[-2:]
     rows, columns = _output_size(config, height, width)
     down, across = (
-        jnp.asarray(cosine_basis(size, size) * (0.5 + 0.5 * np.cos(np.pi * np.arange(size) / size))[:, None] ** blur)
+        (cosine_basis(size, size) * (0.5 + 0.5 * np.cos(np.pi * np.arange(size) / size))[:, None] ** blur).astype(
+            np.float32
+        )
         for size in (height, width)
     )
     # Along rows first: XLA transposes what is multiplied from the left, and with it would compute the label in columns.
-    waves = down.astype(jnp.float32) @ (image @ across.astype(jnp.float32).T)
+    waves = jnp.asarray(down) @ (image @ jnp.asarray(across.T))
     amplitudes = waves[..., :rows, :columns]
     # The waves are orthonormal, so squares add up over them as over pixels.
     axes = (-3, -2, -1)
