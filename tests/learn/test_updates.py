@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +12,8 @@ import pytest
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
-from edqn_jax.learn.learner import UpdateStats
+from edqn_jax.learn.dqn.learner import DqnState, update_q
+from edqn_jax.learn.learner import Rings, UpdateStats
 from edqn_jax.learn.state import init_state
 from edqn_jax.learn.updates import Networks, update_vae
 from tests.support.miniature import miniature_world
@@ -86,3 +90,23 @@ def test_only_updates_that_were_made_are_told_of() -> None:
     )
     stats = UpdateStats.from_updates(loss, {"loss": loss}, finite, made=jnp.int32(0))
     assert np.isnan(stats.metrics["loss"]) and not stats.ill_losses and not stats.ill_gradients
+
+
+def test_target_and_average_follow_the_q_network_at_rates_of_their_own() -> None:
+    config = miniature(1, True)
+    config = dataclasses.replace(
+        config, agent=dataclasses.replace(config.agent, target_rate=0.5, average_rate=0.125, updates_per_step=1)
+    )
+    world = miniature_world(config)
+    state = jax.jit(lambda key: init_state(config, world, key))(jax.random.key(0))
+    before = state.learner.agent
+
+    def update(agent: DqnState, replay: Any, keys: jax.Array) -> tuple[UpdateStats, DqnState]:
+        return update_q(config, None, agent, Rings(replay, jnp.int32(20), keys), 0.0)
+
+    replay = state.actors.replay.replace(reward=jnp.ones_like(state.actors.replay.reward))
+    _, after = jax.jit(update)(before, replay, state.actors.key)
+    assert not equal(before.q, after.q)
+    for name, rate in (("target", 0.5), ("average", 0.125)):
+        wanted = jax.tree.map(lambda new, old, rate=rate: rate * new + (1 - rate) * old, after.q, getattr(before, name))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), getattr(after, name), wanted)

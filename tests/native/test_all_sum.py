@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from functools import partial
 
 import jax
@@ -81,3 +83,32 @@ def test_where_it_is_not_at_hand_xla_adds(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(module, "is_available", lambda: False)
     text = spread(lambda x: all_sum(x, "d", 0.0)).lower(arrays(0)).as_text()
     assert "all_reduce" in text and "edqn_all_sum" not in text
+
+
+OF_THREE = """
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, PartitionSpec
+
+from edqn_jax.native.all_sum import all_sum
+
+jax.config.update("jax_num_cpu_devices", 3)
+rng = np.random.default_rng(0)
+given = {str(n): jnp.asarray(rng.normal(size=(3, n)), jnp.float32) for n in (1, 2, 1500, 4097)}
+given["count"] = jnp.asarray(rng.integers(-9, 9, (3, 4)), jnp.int32)
+mesh, spec = Mesh(np.asarray(jax.devices()), ("d",)), PartitionSpec("d")
+spread = lambda f: jax.jit(jax.shard_map(f, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))(given)
+ours, theirs = spread(lambda x: all_sum(x, "d", 0.0)), spread(lambda x: lax.psum(x, "d"))
+for name, found in ours.items():
+    for device in range(3):
+        np.testing.assert_array_equal(found[device], found[0])
+    np.testing.assert_allclose(found, theirs[name], rtol=1e-6, atol=1e-6)
+print(len(jax.devices()), "devices")
+"""
+
+
+def test_three_devices_share_out_what_they_add() -> None:
+    done = subprocess.run([sys.executable, "-c", OF_THREE], capture_output=True, text=True, timeout=300)
+    assert done.stdout == "3 devices\n", done.stderr

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +17,8 @@ from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form
 from edqn_jax.learn.perception.patch_encoder import log_counts
+from edqn_jax.learn.perception.patches import TARGET
+from edqn_jax.native.own_programs import own_program
 from edqn_jax.native.products import in_precision
 from edqn_jax.sim.sensors import event_field
 from edqn_jax.sim.task.observation import MOTION_SIZE
@@ -203,3 +207,26 @@ def test_the_gradient_of_rounded_products_is_near_that_of_plain_ones() -> None:
     plain, rounded = gradient("float32"), gradient("bfloat16")
     off = np.linalg.norm(rounded - plain) / np.linalg.norm(plain)
     assert 1e-5 < off < 3e-2
+
+
+@pytest.mark.parametrize("pairs", [1, 2])
+def test_codes_and_gradients_are_those_of_programs_without_c(pairs: int) -> None:
+    camera = CameraConfig(width=16, height=12)
+    rng = np.random.default_rng(pairs)
+    count = rng.poisson(0.7, (3, pairs, camera.height, camera.width)).astype(np.int32)
+    polarity = np.where(count > 0, rng.choice([-1, 1], count.shape), 0).astype(np.int8)
+    times = np.zeros(count.shape, np.float32)
+    fields = event_field.EventField(*map(jnp.asarray, (count, polarity, times, times)), window_s=0.04)
+    params, motion = shaken(fresh(CONFIG, camera, jax.random.key(0), layers=pairs)), jnp.stack([MOTION] * 3)
+
+    def total(params: Any) -> jax.Array:
+        mean, log_variance = vae.encode(CONFIG, params, fields, motion)
+        return jnp.sum(jnp.sin(mean)) + jnp.sum(jnp.cos(log_variance))
+
+    plain = jax.jit(jax.value_and_grad(total))(params)
+    with own_program():
+        program = jax.jit(jax.value_and_grad(lambda p: total(p)))
+        assert (f"@{TARGET}" in program.lower(params).as_text()) is (shutil.which("cc") is not None)
+        in_c = program(params)
+    # Sums of up to 36 patches of 32 numbers, in another order.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), in_c, plain)
