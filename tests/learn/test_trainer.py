@@ -188,6 +188,15 @@ def test_a_poisoned_parameter_stops_all_updates_and_spoils_no_saved_policy(on_on
 
 
 @pytest.mark.slow
+def test_a_poisoned_encoder_is_told_of_and_acts_in_no_flight(on_one) -> None:
+    state, losses = flown_on(
+        on_one[3], 4, lambda state: changed(state, "learner.vae", lambda x: x.at[(0,) * x.ndim].set(np.nan))
+    )
+    np.testing.assert_array_equal(losses.health.parameters, np.ones(TINY.train.chunk_steps))
+    assert finite(state.learner.encoder) and finite(state.learner.agent)
+
+
+@pytest.mark.slow
 def test_a_poisoned_transition_costs_the_updates_that_meet_it_and_nothing_else(on_one) -> None:
     made, plan = on_one[3], Schedule.from_config(TINY)
     written = 2 * TINY.train.chunk_steps - plan.warmup  # rows before the last chunk
