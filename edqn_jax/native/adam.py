@@ -63,7 +63,7 @@ class Adam:
 
         Args:
             averages: moving averages of the parameters, and the share of the new parameters in each.
-            scale: by which the gradient is multiplied first.
+            scale: [] by which the gradient is multiplied first.
         """
         arrays = jax.tree.leaves((params, gradient, [old for old, _ in averages]))
         are_vectors = isinstance(params, Array) and all(x.ndim == 1 and x.dtype == jnp.float32 for x in arrays)

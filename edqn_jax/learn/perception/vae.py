@@ -105,7 +105,12 @@ def decoder_target(config: EncoderConfig, sensed: EventField | Array, nearness: 
 
 
 def target_in_waves(config: EncoderConfig, sensed: EventField | Array, nearness: Array | None = None) -> Target:
-    """Returns `decoder_target` in the standing waves that the decoder draws."""
+    """Returns `decoder_target` in the standing waves that the decoder draws.
+
+    Args:
+        sensed: field `[..., F, H, W]` or pictures `[..., C, H, W]`.
+        nearness: `[..., H, W]` without a unit; needed unless the target is `sensed`.
+    """
     return in_waves(config, _sharp_target(config, sensed, nearness), config.target_blur)
 
 
