@@ -20,9 +20,9 @@ from edqn_jax.sim.sensors.event_field import EventField, in_units
 
 
 def log_counts(field: EventField, pixels: int, overlap: int = 0) -> list[Array]:
-    """Returns log(1 + count) of ON and of OFF events, of each pair of frames, in patches: arrays [..., N, *].
+    """Returns log(1 + count) of ON and of OFF events, of each pair of frames, in patches of several arrays.
 
-    Joined, they are [..., N, 2 F K], see `signed_patches`.
+    Joined, they are `[..., N, 2 F K]`; each is of one or of both, see `signed_patches`.
     With noise, a pixel's ON and OFF events between two frames stand in rows of their own.
 
     Args:
