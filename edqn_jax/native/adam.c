@@ -15,7 +15,7 @@
 #define LANES 32
 
 /* Of the first operand, in the order of `adam.py`; after them the rate of each follower. */
-enum { SCALE, MOST_NORM, STEP, FIRST_DECAY, SECOND_DECAY, SECOND_CORRECTION, TINY, FOLLOWER_RATES };
+enum { SCALE, MAX_NORM, STEP, FIRST_DECAY, SECOND_DECAY, SECOND_CORRECTION, EPSILON, FOLLOWER_RATES };
 
 enum { GRADIENT = 1, PARAMETERS }; /* operands; from PARAMETERS on they are changed */
 
@@ -25,30 +25,22 @@ enum { GRADIENT = 1, PARAMETERS }; /* operands; from PARAMETERS on they are chan
 static float* operand(const XLA_FFI_CallFrame* call, int i) { return ((XLA_FFI_Buffer*)call->args.args[i])->data; }
 static float* result(const XLA_FFI_CallFrame* call, int i) { return ((XLA_FFI_Buffer*)call->rets.rets[i])->data; }
 
+static inline void measure_one(float x, float* square, int32_t* largest) {
+  int32_t bits; /* without the sign, since compilers may take it that floats are finite */
+  memcpy(&bits, &x, sizeof bits);
+  bits &= 0x7fffffff;
+  *largest = bits > *largest ? bits : *largest;
+  *square += x * x;
+}
+
 /* Returns whether all numbers are finite, and gives the sum of their squares. */
 static int measure(const float* restrict x, int64_t count, float* restrict squares) {
-  float sums[LANES] = {0};
-  int32_t largest[LANES] = {0}; /* bits without the sign, since compilers may take it that floats are finite */
+  float sums[LANES] = {0}, total = 0.0f;
+  int32_t largest[LANES] = {0}, most = 0;
   int64_t k = 0;
   for (; k + LANES <= count; k += LANES)
-    for (int lane = 0; lane < LANES; ++lane) {
-      const float value = x[k + lane];
-      int32_t bits;
-      memcpy(&bits, &value, sizeof bits);
-      bits &= 0x7fffffff;
-      largest[lane] = bits > largest[lane] ? bits : largest[lane];
-      sums[lane] += value * value;
-    }
-  for (int lane = 0; k < count; ++k, ++lane) {
-    const float value = x[k];
-    int32_t bits;
-    memcpy(&bits, &value, sizeof bits);
-    bits &= 0x7fffffff;
-    largest[lane] = bits > largest[lane] ? bits : largest[lane];
-    sums[lane] += value * value;
-  }
-  int32_t most = 0;
-  float total = 0.0f;
+    for (int lane = 0; lane < LANES; ++lane) measure_one(x[k + lane], &sums[lane], &largest[lane]);
+  for (int lane = 0; k < count; ++k, ++lane) measure_one(x[k], &sums[lane], &largest[lane]);
   for (int lane = 0; lane < LANES; ++lane) {
     most = largest[lane] > most ? largest[lane] : most;
     total += sums[lane];
@@ -60,13 +52,13 @@ static int measure(const float* restrict x, int64_t count, float* restrict squar
 static void step(const float* restrict numbers, float scale, int64_t count, const float* restrict gradient,
                  float* restrict parameters, float* restrict first, float* restrict second) {
   const float size = numbers[STEP], decay = numbers[FIRST_DECAY], other_decay = numbers[SECOND_DECAY];
-  const float correction = numbers[SECOND_CORRECTION], tiny = numbers[TINY];
+  const float correction = numbers[SECOND_CORRECTION], epsilon = numbers[EPSILON];
   for (int64_t k = 0; k < count; ++k) {
     const float g = scale * gradient[k];
     const float m = decay * first[k] + (1.0f - decay) * g;
     const float v = other_decay * second[k] + (1.0f - other_decay) * g * g;
     first[k] = m, second[k] = v;
-    parameters[k] -= size * m / (sqrtf(v * correction) + tiny);
+    parameters[k] -= size * m / (sqrtf(v * correction) + epsilon);
   }
 }
 
@@ -80,7 +72,7 @@ static int step_all(const float* numbers, const float* gradient, int64_t count, 
   if (!measure(gradient, count, &squares)) return 0;
   float scale = numbers[SCALE];
   const float norm = sqrtf(squares) * scale;
-  if (numbers[MOST_NORM] >= 0.0f && norm >= numbers[MOST_NORM]) scale *= numbers[MOST_NORM] / norm;
+  if (numbers[MAX_NORM] >= 0.0f && norm >= numbers[MAX_NORM]) scale *= numbers[MAX_NORM] / norm;
   for (int64_t from = 0; from < count; from += BLOCK) {
     const int64_t size = count - from < BLOCK ? count - from : BLOCK;
     float* parameters = changed[0] + from;

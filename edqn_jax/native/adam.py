@@ -18,7 +18,7 @@ SOURCE = Path(__file__).with_suffix(".c")
 
 TARGET = "edqn_adam"
 
-FIRST_DECAY, SECOND_DECAY, TINY = 0.9, 0.999, 1e-8
+FIRST_DECAY, SECOND_DECAY, EPSILON = 0.9, 0.999, 1e-8
 
 NO_LIMIT = -1.0
 """To C, the longest norm of gradients that are not shortened."""
@@ -44,7 +44,7 @@ class Adam:
     rate: Array | float | optax.Schedule
     """Step size."""
 
-    most_norm: float | None = None
+    max_norm: float | None = None
     """Longer gradients are shortened to this norm; None leaves them as they are."""
 
     def init(self, params: Any) -> Any:
@@ -93,8 +93,8 @@ class Adam:
         rate = self.rate(moments.count) if callable(self.rate) else self.rate
         first, second = (1.0 / (1.0 - decay**count) for decay in (FIRST_DECAY, SECOND_DECAY))
         rates = [rate for _, rate in averages]
-        most_norm = NO_LIMIT if self.most_norm is None else self.most_norm
-        numbers = (scale, most_norm, rate * first, FIRST_DECAY, SECOND_DECAY, second, TINY, *rates)
+        max_norm = NO_LIMIT if self.max_norm is None else self.max_norm
+        numbers = (scale, max_norm, rate * first, FIRST_DECAY, SECOND_DECAY, second, EPSILON, *rates)
         changed = (params, moments.mu, moments.nu, *(old for old, _ in averages))
         shapes = [jax.ShapeDtypeStruct(params.shape, params.dtype)] * len(changed)
         call = jax.ffi.ffi_call(
@@ -114,9 +114,9 @@ class Adam:
         return Stepped(params, state, tuple(followed), finite)
 
     def _in_optax(self) -> optax.GradientTransformation:
-        adam = optax.adam(self.rate, FIRST_DECAY, SECOND_DECAY, TINY)
-        if self.most_norm is not None:
-            adam = optax.flatten(optax.chain(optax.clip_by_global_norm(self.most_norm), adam))
+        adam = optax.adam(self.rate, FIRST_DECAY, SECOND_DECAY, EPSILON)
+        if self.max_norm is not None:
+            adam = optax.flatten(optax.chain(optax.clip_by_global_norm(self.max_norm), adam))
         return optax.apply_if_finite(adam, max_consecutive_errors=2**31 - 1)
 
 

@@ -4,8 +4,7 @@
  * XLA's own sum lets a device sleep several times until another has arrived, and waking up takes longer than the sum.
  * Here devices spin at first, since each has a thread and all arrive at about the same time. The devices of one
  * execution meet in a place that nobody else uses meanwhile; each adds up its share of the elements, in the order of
- * the devices, and writes it to the results of all. Of two devices each adds up everything for itself: what another
- * core has written takes longer to read than to add.
+ * the devices, and writes it to the results of all.
  */
 
 #include <sched.h>
@@ -115,18 +114,16 @@ static void* result(const XLA_FFI_CallFrame* call, int i) { return ((XLA_FFI_Buf
 #define CHUNK 1024 /* elements added at a time, so that they stay in the cache */
 
 static void add_share(Place* here, int rank, const XLA_FFI_CallFrame* call) {
-  const int alone = here->expected == 2; /* for its own results */
-  const int parts = alone ? 1 : here->expected, part = alone ? 0 : rank;
-  const int from = alone ? rank : 0, to = alone ? rank + 1 : here->expected; /* devices that get the sums */
   for (int i = 0; i < call->rets.size; ++i) {
     const XLA_FFI_Buffer* buffer = (XLA_FFI_Buffer*)call->rets.rets[i];
-    const int64_t count = elements(buffer), begin = count * part / parts, end = count * (part + 1) / parts;
+    const int64_t count = elements(buffer), begin = count * rank / here->expected;
+    const int64_t end = count * (rank + 1) / here->expected;
     if (buffer->dtype == XLA_FFI_DataType_S32) {
       for (int64_t k = begin; k < end; ++k) {
         int32_t total = 0;
         for (int d = 0; d < here->expected; ++d)
           total += ((const int32_t*)operand(here->calls[d], i + OPERANDS_BEFORE))[k];
-        for (int d = from; d < to; ++d) ((int32_t*)result(here->calls[d], i))[k] = total;
+        for (int d = 0; d < here->expected; ++d) ((int32_t*)result(here->calls[d], i))[k] = total;
       }
       continue;
     }
@@ -139,9 +136,9 @@ static void add_share(Place* here, int rank, const XLA_FFI_CallFrame* call) {
         const float* more = (const float*)operand(here->calls[d], i + OPERANDS_BEFORE) + first;
         for (int64_t k = 0; k < size; ++k) total[k] += more[k];
       }
-      for (int d = from; d < to; ++d) {
-        float* sums = (float*)result(here->calls[d], i) + first;
-        for (int64_t k = 0; k < size; ++k) sums[k] = total[k];
+      for (int d = 0; d < here->expected; ++d) {
+        float* to = (float*)result(here->calls[d], i) + first;
+        for (int64_t k = 0; k < size; ++k) to[k] = total[k];
       }
     }
   }

@@ -21,11 +21,11 @@ RATES = 0.25, 0.01
 """Of the averages that follow."""
 
 
-def in_optax(rate: Any, most_norm: float | None, gradients: list[Array], params: Any) -> tuple[Any, ...]:
+def in_optax(rate: Any, max_norm: float | None, gradients: list[Array], params: Any) -> tuple[Any, ...]:
     """Returns parameters, both averages and moments after steps of `optax.adam`, as its users write them."""
     adam = optax.adam(rate)
-    if most_norm is not None:
-        adam = optax.chain(optax.clip_by_global_norm(most_norm), adam)
+    if max_norm is not None:
+        adam = optax.chain(optax.clip_by_global_norm(max_norm), adam)
     state, averages = adam.init(params), [params, params]
     for gradient in gradients:
         change, state = adam.update(gradient, state, params)
@@ -56,19 +56,19 @@ def run(adam: Adam, gradients: Array, params: Array, *, in_c: bool, scale: float
 
 
 @pytest.mark.parametrize("in_c", [True, False])
-@pytest.mark.parametrize(("size", "most_norm"), [(7, None), (37, 0.5), (37, math.inf), (1300, 0.5), (1024, 1e6)])
-def test_steps_are_those_of_optax(size: int, most_norm: float | None, in_c: bool) -> None:
+@pytest.mark.parametrize(("size", "max_norm"), [(7, None), (37, 0.5), (37, math.inf), (1300, 0.5), (1024, 1e6)])
+def test_steps_are_those_of_optax(size: int, max_norm: float | None, in_c: bool) -> None:
     rng = np.random.default_rng(size)
     params, gradients = jnp.asarray(rng.normal(size=size), jnp.float32), rng.normal(size=(4, size)).astype(np.float32)
-    rate = 1e-2 if most_norm is None else optax.linear_schedule(1e-2, 1e-3, 3)
-    found = run(Adam(rate, most_norm), jnp.asarray(gradients), params, in_c=in_c, scale=0.5)
-    wanted = in_optax(rate, most_norm, [jnp.asarray(each) / 2 for each in gradients], params)
+    rate = 1e-2 if max_norm is None else optax.linear_schedule(1e-2, 1e-3, 3)
+    found = run(Adam(rate, max_norm), jnp.asarray(gradients), params, in_c=in_c, scale=0.5)
+    wanted = in_optax(rate, max_norm, [jnp.asarray(each) / 2 for each in gradients], params)
     moments = [optax.tree_utils.tree_get(found.state, name) for name in ("mu", "nu")]
     assert found.finite.all()
     for ours, theirs in zip((found.params, *found.averages, *moments), wanted, strict=True):
         # Both round each number a few times, in another order.
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-7)
-    assert int(found.state.inner_state[-1][0].count if most_norm else found.state.inner_state[0].count) == 4
+    assert int(found.state.inner_state[-1][0].count if max_norm else found.state.inner_state[0].count) == 4
 
 
 @pytest.mark.parametrize("in_c", [True, False])

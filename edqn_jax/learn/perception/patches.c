@@ -15,11 +15,11 @@ static inline void cut(const float* restrict image, int64_t images, int64_t rows
     for (int64_t down = 0; down < side; ++down) {
       const float* from = image + (line * side + down) * width;
       for (int64_t column = 0; column < columns; ++column, from += side) {
-        float* positive = patches + (line * columns + column) * 2 * area + down * side;
+        float* patch = patches + (line * columns + column) * 2 * area + down * side;
         for (int64_t across = 0; across < side; ++across) {
           const float value = from[across];
-          positive[across] = value > 0.0f ? value : 0.0f;
-          positive[area + across] = value < 0.0f ? -value : 0.0f;
+          patch[across] = value > 0.0f ? value : 0.0f;
+          patch[area + across] = value < 0.0f ? -value : 0.0f;
         }
       }
     }
