@@ -168,6 +168,21 @@ AXES: dict[str, Axis] = {
         ),
         same_flown=True,
     ),
+    "fine": Axis(
+        "Thin trunks and wires, coarse and fine pixels, a camera on the body at 8 m/s",
+        ("wires",),
+        {
+            f"{width} x {height}": ("--camera.width", str(width), "--camera.height", str(height))
+            for width, height in ((64, 48), (128, 96))
+        },
+        REAL,
+        {f"{lux:g} lux": {"light": {"least_lux": lux, "most_lux": lux}} for lux in (50.0, 500.0)},
+        (
+            *("--camera.mount", "body", "--camera.samples-down", "3", "--env.speed-m-s", "8"),
+            *("--encoder.replay-size", "65536", "--light.least-lux", "50", "--light.most-lux", "500"),
+        ),
+        same_flown=True,
+    ),
 }
 """By name."""
 

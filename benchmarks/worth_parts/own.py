@@ -1,4 +1,4 @@
-"""What the axes see and fly beside what the package has: two sensors, and worlds with nothing but balls."""
+"""What the axes see and fly beside what the package has: two sensors, worlds with nothing but balls, and with wires."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ from jax import Array
 import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.config.registry import FAMILIES, SENSORS
+from edqn_jax.keys import uniform_parts
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.sensors.built_in import CHANGE_SCALE
 from edqn_jax.sim.sensors.sensor import Image, last_view, nearness_image
-from edqn_jax.sim.worlds import building
+from edqn_jax.sim.worlds import building, discs
 from edqn_jax.sim.worlds.free_points import TRIES
 
 MOST_LATE = 3
@@ -23,6 +24,13 @@ MOST_LATE = 3
 
 COURT_M = (40.0, 40.0, 16.0)
 """Flight volume of the worlds `court`, metres: missions are 20 m long or more."""
+
+WIRES_M = (40.0, 40.0, 9.0)
+"""Flight volume of the worlds `wires`, metres, as that of forests: the trunks reach its ceiling."""
+TRUNKS, TRUNK_RADIUS, TRUNK_GAP = 64, (0.04, 0.12), 2.0
+"""Trunks if all find a place, their radii and the free metres between any two, at least."""
+WIRES, WIRE_LENGTH, WIRE_RADIUS, WIRE_HEIGHT = 64, (6.0, 14.0), (0.01, 0.03), (0.8, 8.2)
+"""Wires: how many, how long, half as wide as, and how high, metres. They are level, and square in section."""
 
 
 def difference() -> edqn_jax.Sensor:
@@ -83,10 +91,35 @@ def sample_court(key: Array) -> Scene:
     return building.build_scene(COURT_M, jax.random.uniform(key, (2, TRIES, 3)), building.make_ground())
 
 
+def sample_wires(key: Array) -> Scene:
+    """Returns a world of thin trunks and of wires across it, a start and a goal; the key is consumed."""
+    counts = (TRUNKS, TRUNKS * 2 * discs.PLACES, WIRES * 6, (TRUNKS + WIRES) * building.COLOUR_DRAWS, 2 * TRIES * 3)
+    thick, places, drawn, colours, ends = uniform_parts(key, counts)
+    radius = building.scale_uniforms(TRUNK_RADIUS, thick)
+    candidates = discs.candidates_inside(radius, places.reshape(TRUNKS, discs.PLACES, 2), WIRES_M[:2], 0.0)
+    x, y, placed = discs.place_discs(radius, candidates, TRUNK_GAP)
+    albedo = building.make_albedos(colours.reshape(TRUNKS + WIRES, -1))
+
+    wire = drawn.reshape(WIRES, 6)
+    half = jnp.stack([building.scale_uniforms(WIRE_LENGTH, wire[:, 0]) / 2, *2 * [jnp.zeros(WIRES)]], axis=1)
+    half = half.at[:, 1:].set(building.scale_uniforms(WIRE_RADIUS, wire[:, 1])[:, None])
+    middle = jnp.column_stack([wire[:, 2:4] * jnp.array(WIRES_M[:2]), building.scale_uniforms(WIRE_HEIGHT, wire[:, 4])])
+    return building.build_scene(
+        WIRES_M,
+        ends.reshape(2, TRIES, 3),
+        building.make_ground(),
+        building.make_boxes(jnp.ones(WIRES, bool), middle, half, jnp.pi * wire[:, 5], albedo[TRUNKS:]),
+        building.make_cylinders(
+            placed, jnp.stack([x, y, jnp.full(TRUNKS, WIRES_M[2] / 2)], axis=1), radius, WIRES_M[2] / 2, albedo[:TRUNKS]
+        ),
+    )
+
+
 def register() -> None:
     """Registers these sensors and worlds, once."""
     if "court" in FAMILIES:
         return
+    FAMILIES.register("wires", edqn_jax.Family(sample_wires, WIRES_M, detours=True), "thin trunks, and wires across")
     FAMILIES.register("court", edqn_jax.Family(sample_court, COURT_M, edge_m=None), "nothing but balls that are thrown")
     SENSORS.register("frame-difference", difference(), "how the brightness has changed between two frames")
     for count in range(1, MOST_LATE + 1):

@@ -112,6 +112,34 @@ def test_shade_is_trained_and_flown_without_and_with_cast_shadows() -> None:
     )  # depth and nothing do not change in the shade
 
 
+def test_wires_are_flown_with_two_cameras_of_which_one_has_four_times_the_pixels() -> None:
+    axis = AXES["fine"]
+    coarse, fine = (config_of(axis, Place("wires", name, "events"), []) for name in axis.trained)
+    assert fine.camera.width * fine.camera.height == 4 * coarse.camera.width * coarse.camera.height
+    width, height = coarse.camera.width, coarse.camera.height
+    same = dataclasses.replace(fine, camera=dataclasses.replace(fine.camera, width=width, height=height))
+    assert same == coarse and coarse.camera.mount == "body" and coarse.env.speed_m_s == 8
+
+
+def test_trunks_of_wires_keep_apart_and_wires_hang_level_between_floor_and_ceiling() -> None:
+    scenes = jax.vmap(own.sample_wires)(jax.random.split(jax.random.key(0), 16))
+    wires, trunks = scenes.boxes, scenes.cylinders
+    (low, high), (thin, thick) = own.WIRE_HEIGHT, own.WIRE_RADIUS
+    assert bool(jnp.all((wires.position[..., 2] >= low) & (wires.position[..., 2] <= high)))
+    assert bool(jnp.all((wires.half[..., 1] >= thin) & (wires.half[..., 1] <= thick)))
+    assert bool(jnp.all(wires.half[..., 1] == wires.half[..., 2]))
+    assert bool(jnp.all(2 * wires.half[..., 0] >= own.WIRE_LENGTH[0]))
+    assert float(jnp.std(wires.yaw)) > 0.5 and float(jnp.std(wires.position[..., 0])) > 5  # all ways, all over
+    standing = trunks.radius > 0
+    assert bool(jnp.all(standing.sum(axis=1) > 50))
+    apart = jnp.linalg.norm(trunks.position[:, :, None, :2] - trunks.position[:, None, :, :2], axis=-1)
+    apart = apart - trunks.radius[:, :, None] - trunks.radius[:, None]
+    pairs = standing[:, :, None] & standing[:, None] & ~jnp.eye(own.TRUNKS, dtype=bool)
+    assert float(jnp.where(pairs, apart, jnp.inf).min()) >= own.TRUNK_GAP - 1e-4  # in float32, of 40 m
+    tops = trunks.position[..., 2] + trunks.half_height
+    assert bool(jnp.all(jnp.where(standing, tops, own.WIRES_M[2]) == own.WIRES_M[2]))
+
+
 def test_cameras_of_one_size_average_equally_many_pixels() -> None:
     axis, usual = AXES["size"], config_of(AXES["dark"], Place("medium", "8 m/s", "frames"), SMALL)
     events, frames = (config_of(axis, Place("medium", "8 m/s", sensor), SMALL) for sensor in ("events", "frames"))
