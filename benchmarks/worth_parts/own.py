@@ -27,9 +27,9 @@ COURT_M = (40.0, 40.0, 16.0)
 
 WIRES_M = (40.0, 40.0, 9.0)
 """Flight volume of the worlds `wires`, metres, as that of forests: the trunks reach its ceiling."""
-TRUNKS, TRUNK_RADIUS, TRUNK_GAP = 64, (0.04, 0.12), 2.0
+TRUNKS, TRUNK_RADIUS, TRUNK_GAP = 48, (0.04, 0.12), 2.0
 """Trunks if all find a place, their radii and the free metres between any two, at least."""
-WIRES, WIRE_LENGTH, WIRE_RADIUS, WIRE_HEIGHT = 64, (6.0, 14.0), (0.01, 0.03), (0.8, 8.2)
+WIRES, WIRE_LENGTH, WIRE_RADIUS, WIRE_HEIGHT = 40, (6.0, 14.0), (0.015, 0.04), (0.8, 8.2)
 """Wires: how many, how long, half as wide as, and how high, metres. They are level, and square in section."""
 
 

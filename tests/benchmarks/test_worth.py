@@ -131,7 +131,7 @@ def test_trunks_of_wires_keep_apart_and_wires_hang_level_between_floor_and_ceili
     assert bool(jnp.all(2 * wires.half[..., 0] >= own.WIRE_LENGTH[0]))
     assert float(jnp.std(wires.yaw)) > 0.5 and float(jnp.std(wires.position[..., 0])) > 5  # all ways, all over
     standing = trunks.radius > 0
-    assert bool(jnp.all(standing.sum(axis=1) > 50))
+    assert bool(jnp.all(standing.sum(axis=1) > 40))
     apart = jnp.linalg.norm(trunks.position[:, :, None, :2] - trunks.position[:, None, :, :2], axis=-1)
     apart = apart - trunks.radius[:, :, None] - trunks.radius[:, None]
     pairs = standing[:, :, None] & standing[:, None] & ~jnp.eye(own.TRUNKS, dtype=bool)
