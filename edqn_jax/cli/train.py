@@ -385,7 +385,8 @@ def is_tuned_for_gpu(options: TrainOptions, config: Config) -> bool:
 def options_to_compare(config: Config) -> str:
     """Returns what processes must have alike: all options, and in place of a world file's path what it holds.
 
-    Also whether their devices draw in C, since all must run the same program.
+    Of several also whether their devices draw in C, since all must run the same program; one alone need not wait for
+    the compiler to know.
 
     Raises:
         ConfigError: if there is no such file, or it cannot be read.
@@ -397,7 +398,8 @@ def options_to_compare(config: Config) -> str:
     world = dataclasses.replace(
         config.world, name=_world_digest(config.world.name), flown=_world_digest(config.world.flown)
     )
-    in_c = native.is_available("cpu" if jax.default_backend() == "cpu" else "cuda")
+    platform = "cpu" if jax.default_backend() == "cpu" else "cuda"
+    in_c = jax.process_count() == 1 or native.is_available(platform)
     return f"{to_yaml(dataclasses.replace(config, world=world))}in_c: {in_c}\n"
 
 

@@ -21,6 +21,7 @@ MAX_BYTES = 2**30
 
 
 _enabled: list[Path] = []  # the folder, once this process keeps programs in it
+_trimmed: set[Path] = set()  # folders in which this process has made room
 
 
 def enable_compilation_cache() -> None:
@@ -53,7 +54,7 @@ def enabled_folder() -> Path | None:
 
 
 def private_folder() -> Path | None:
-    """Creates and returns the cache folder for this kind of CPU, trimmed to its size limit.
+    """Creates and returns the cache folder for this kind of CPU, trimmed to its size limit by the first call.
 
     None where it cannot be written, or where others may write: what is in it is run.
     """
@@ -66,7 +67,9 @@ def private_folder() -> Path | None:
             return None
         if not os.access(folder, os.W_OK):
             return None
-        _make_room(folder, MAX_BYTES)
+        if folder not in _trimmed:  # of a full one this takes tenths of a second
+            _make_room(folder, MAX_BYTES)
+            _trimmed.add(folder)
     except (OSError, RuntimeError):  # there is no home
         return None
     return folder

@@ -16,7 +16,7 @@ from edqn_jax.evaluation.places import Point, check_seed, moved_ends, place_in_f
 from edqn_jax.kept_programs import kept_jit
 from edqn_jax.keys import CROSSING_OF_WORLD, FILE_MISSIONS, run_streams
 from edqn_jax.planning.astar import shortest_path
-from edqn_jax.planning.free_space import find_reachable, is_reachable
+from edqn_jax.planning.free_space import is_reachable, kept_reachable
 from edqn_jax.planning.lattice import CELL_M, lattice_shape
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world
@@ -260,7 +260,7 @@ def _with_a_way(pool: Scene, config: Config, name: str, own_start: bool = False)
     scene, radius = take_scene(pool, 0), config.drone.body_radius_m
     if own_start:
         lattice_shape(scene, np.asarray(scene.start, np.float64), CELL_M)  # A* searches the way from there
-    found = find_reachable(scene, radius)
+    found = kept_reachable(scene, radius)
     if found.lost == 0.0:
         return None, None
     if own_start and not is_reachable(found, scene.start):

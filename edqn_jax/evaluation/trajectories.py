@@ -9,6 +9,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
@@ -72,7 +73,7 @@ def actions_of(flown: Mapping[str, np.ndarray]) -> np.ndarray:
     return columns_of(flown, names) if names else flown["action"]
 
 
-def directions(config: Config, poses: Flight, actions: np.ndarray) -> np.ndarray:
+def directions(config: Config, poses: Flight, actions: np.ndarray | Array) -> Array:
     """Returns the directions [T, 3] that actions commanded, in the heading frame, see `ActionSet.direction`.
 
     Args:
@@ -87,7 +88,7 @@ def directions(config: Config, poses: Flight, actions: np.ndarray) -> np.ndarray
         body = DroneState(pose.position, pose.quaternion, pose.velocity, still, yaw_of(pose.quaternion))
         return actions_flown.direction(body, action)
 
-    return np.asarray(jax.vmap(direction)(poses, jnp.asarray(actions, actions_flown.space.dtype)))
+    return jax.vmap(direction)(poses, jnp.asarray(actions, actions_flown.space.dtype))
 
 
 def write_trajectories(config: Config, missions: MissionSet, flights: Flights, file: Path) -> None:

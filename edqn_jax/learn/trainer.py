@@ -41,6 +41,19 @@ def _with_sharding(shapes: Any, sharding: NamedSharding) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
 
 
+def _cut(whole: Array, laid_out: jax.ShapeDtypeStruct) -> Array:
+    """Returns an array that this process has, laid out over the devices of all; `whole` is deleted."""
+    if jnp.issubdtype(whole.dtype, jax.dtypes.prng_key):
+        return jax.jit(jax.random.wrap_key_data, out_shardings=laid_out.sharding)(
+            np.asarray(jax.random.key_data(whole))
+        )
+    values = np.asarray(whole)  # through the host: JAX cannot move what one device has to another process
+    assert laid_out.sharding is not None
+    cut = jax.make_array_from_callback(whole.shape, laid_out.sharding, lambda index: values[index])
+    whole.delete()
+    return cut
+
+
 class Trainer:
     """A compiled, donated chunk over a mesh of devices. The state goes in and comes out; nothing is kept here.
 
@@ -73,8 +86,45 @@ class Trainer:
         self._place: Place | None = None
         self._traced: jax.stages.Lowered | None = None
         self._shapes: TrainState | None = None
+        self._first: tuple[Policy | None, Callable[[Array], TrainState]] | None = None
         self._chunk = None
         draw_own_in_c()
+
+    def trace_first(self, start: Policy | None = None) -> Callable[[], None]:
+        """Traces what makes the first state, unless it is kept, and returns what compiles it; `init` then does neither.
+
+        Args:
+            start: as of `init`.
+
+        Raises:
+            ConfigError: likewise.
+        """
+
+        def begin(env_params: EnvParams, key: Array) -> TrainState:
+            state = init_state(self.config, env_params, key)
+            if start is None:
+                return state
+            networks = begin_networks(self.config, state.learner, start.config, start.params)
+            return dataclasses.replace(state, learner=networks)
+
+        device = self._own_device()
+        world = jax.tree.map(lambda leaf: leaf.addressable_data(0), self.env_params)
+        arguments = world, self._keys(range(self.agents or 1))
+        place = Place(None) if start is not None else self._place_of("first_state", arguments, [device])
+
+        def lower() -> list[jax.stages.Lowered]:
+            with own_program():
+                traced = jax.jit(named(self._each(begin, 0), place.name)).trace(*arguments)
+                self._shapes = self._shapes or self._laid_out(traced.out_info)
+                return [traced.lower()]
+
+        lowered = None if place.holds_programs() else lower()
+
+        def compile_first() -> None:
+            [make] = place.load_or_compile(lambda: lowered or lower(), [device])
+            self._first = start, partial(make, world)
+
+        return compile_first
 
     def init(self, seed: int | Sequence[int], start: Policy | None = None) -> TrainState:
         """Returns the state before the first step, laid out over the devices.
@@ -86,22 +136,21 @@ class Trainer:
         Raises:
             ConfigError: if its networks have other shapes, or the learner cannot begin with any.
         """
+        if self._first is None or self._first[0] is not start:
+            self.trace_first(start)()
+        assert self._first is not None
+        keys = self._keys([seed] if isinstance(seed, int) else seed)
+        # Made whole, by each process on one device, and then cut: made in parts it would be rounded otherwise.
+        return jax.tree.map(_cut, self._first[1](keys), self.shapes())
 
-        def begin(env_params: EnvParams, key: Array) -> TrainState:
-            state = init_state(self.config, env_params, key)
-            if start is None:
-                return state
-            networks = begin_networks(self.config, state.learner, start.config, start.params)
-            return dataclasses.replace(state, learner=networks)
+    def _own_device(self) -> jax.Device:  # pyright: ignore[reportInvalidTypeForm]
+        """Returns the first of this process's devices."""
+        return next(each for each in self.mesh.devices.flat if each.process_index == jax.process_index())
 
-        keys = [run_streams(number).learning for number in ([seed] if isinstance(seed, int) else seed)]
-        arguments = self.env_params, keys[0] if self.agents is None else jnp.stack(keys)
-        place = Place(None) if start is not None else self._place_of("first_state", arguments)
-        function = jax.jit(named(self._each(begin, 0), place.name))
-        with own_program():
-            [make] = place.load_or_compile(lambda: [function.lower(*arguments)], [*self.mesh.devices.flat])
-        # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
-        return jax.jit(lambda state: state, out_shardings=self._layout())(make(*arguments))
+    def _keys(self, seeds: Sequence[int]) -> Array:
+        """Returns the agents' keys [K] of their seeds, [] of one agent."""
+        keys = [run_streams(seed).learning for seed in seeds]
+        return keys[0] if self.agents is None else jnp.stack(keys)
 
     def _each(self, function: Callable[..., Any], *axes: int | None) -> Callable[..., Any]:
         """Returns `function(world, *arguments)` for all agents; `axes` are those of the other arguments."""
@@ -129,9 +178,12 @@ class Trainer:
         if isinstance(self._chunk, jax.stages.Compiled):
             shapes = self._chunk.args_info[0][1]
         else:
-            key = jax.random.key(0)
-            keys = key if self.agents is None else jax.random.split(key, self.agents)
+            keys = self._keys(range(self.agents or 1))
             shapes = jax.eval_shape(self._each(partial(init_state, self.config), 0), self.env_params, keys)
+        return self._laid_out(shapes)
+
+    def _laid_out(self, shapes: Any) -> TrainState:
+        """Returns a state's shapes and types with the layout that its arrays have."""
         layout = self._layout()
         return TrainState(
             actors=_with_sharding(shapes.actors, layout.actors),
@@ -170,18 +222,22 @@ class Trainer:
         if self._chunk is None and self._traced is None:
             self._traced = self._lower()
 
+    def is_kept(self) -> bool:
+        """Returns whether an earlier command has kept the chunk, so that nothing is traced."""
+        self._load()
+        return self._chunk is not None
+
     def _load(self) -> None:
         """Loads the chunk if it is kept. The shapes of states follow from the configuration, and need not be known."""
         if self._place is None and not self.config.train.debug:
-            self._place = self._place_of("training", (self.env_params, self._steps(0)))
+            self._place = self._place_of("training", (self.env_params, self._steps(0)), [*self.mesh.devices.flat])
             [self._chunk] = self._place.load() or [None]
 
-    def _place_of(self, name: str, arguments: Any) -> Place:
-        """Returns where a program of this trainer is kept; nowhere if it may hold what is in a teacher's files."""
+    def _place_of(self, name: str, arguments: Any, on: Sequence[Any]) -> Place:
+        """Returns where a program for these devices is kept; nowhere if it may hold what is in a teacher's files."""
         if learner_of(self.config).teacher is not None:
             return Place(None)
-        devices = [device.id for device in self.mesh.devices.flat]
-        return place_of(name, (without_seed(self.config), self.agents, devices), arguments)
+        return place_of(name, (without_seed(self.config), self.agents, [device.id for device in on]), arguments)
 
     def _lower(self) -> jax.stages.Lowered:
         # One spec for each subtree: only environments and replay are spread, and what they return.

@@ -24,14 +24,12 @@ import sys
 import time
 from collections.abc import Callable
 
-import jax
 import numpy as np
 from jax import Array
 
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.devices.kept_files import kept_array, name_of
 from edqn_jax.errors import ConfigError
-from edqn_jax.kept_programs import digest_of_package, folder_without_user_code
+from edqn_jax.planning.kept import kept_of_scene
 from edqn_jax.planning.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small, leg_touches
 from edqn_jax.planning.path import PlannedPath, not_found, path_as_plan, path_length, point_text
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, resolve_world
@@ -102,10 +100,7 @@ def kept_shortest_path(scene: Scene, radius: float) -> Path:
         found = shortest_path(scene, scene.start, scene.goal, radius)
         return np.concatenate([[[found.length_m, found.grid_length_m, 0.0]], found.points])
 
-    leaves, form = jax.tree.flatten(scene)
-    told_apart = f"{form} {radius} {[leaf.shape for leaf in leaves]} {digest_of_package()}"
-    name = name_of(told_apart.encode(), *(np.asarray(leaf).tobytes() for leaf in leaves))
-    kept = kept_array(folder_without_user_code(), f"path-{name}", make)
+    kept = kept_of_scene("path", scene, radius, make)
     return Path(kept[1:], float(kept[0, 0]), float(kept[0, 1]))
 
 

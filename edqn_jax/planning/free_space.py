@@ -8,6 +8,7 @@ import numpy as np
 import scipy
 from jax import Array
 
+from edqn_jax.planning.kept import kept_of_scene
 from edqn_jax.planning.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small
 from edqn_jax.planning.path import point_text
 from edqn_jax.sim.scene.scene import Scene
@@ -64,6 +65,22 @@ def find_reachable(scene: Scene, radius: float, cell: float | None = None) -> Re
     way = free & (parts == parts[tuple(lattice.origin)])
     lost = 1.0 - np.count_nonzero(way) / np.count_nonzero(free)
     return Reachable(way, lattice.middle(np.array(0)), cell, lost if lost > NICHES else 0.0)
+
+
+def kept_reachable(scene: Scene, radius: float) -> Reachable:
+    """Returns `find_reachable` with its own cells; a command finds what an earlier one has found.
+
+    Raises:
+        ConfigError, NoPathError: as `find_reachable`.
+    """
+
+    def make() -> np.ndarray:
+        found = find_reachable(scene, radius)
+        return np.concatenate([found.corner, [found.edge_m, found.lost], found.is_way.shape, found.is_way.ravel()])
+
+    kept = kept_of_scene("reachable", scene, radius, make)
+    shape = kept[5:8].astype(int)
+    return Reachable(kept[8:].reshape(shape).astype(bool), kept[:3], float(kept[3]), float(kept[4]))
 
 
 def is_reachable(found: Reachable, point: np.ndarray | Array) -> bool:

@@ -20,6 +20,7 @@ from jax import Array
 
 from edqn_jax.planning.astar import search_lattice, shortest_path
 from edqn_jax.planning.free_space import COARSE_M
+from edqn_jax.planning.kept import kept_of_scene
 from edqn_jax.planning.lattice import CELL_M, FINE_M, Lattice, NoPathError, is_small
 from edqn_jax.planning.path import path_length
 from edqn_jax.sim.scene.scene import Scene
@@ -98,6 +99,8 @@ def find_widest_way(scene: Scene, radius: float) -> WidestWay | None:
 def is_roomy(scene: Scene, radius: float, need: float) -> bool:
     """Returns whether coarse cells show a way with a clearance of `need` metres; quick, and False where it is unknown.
 
+    A command finds what an earlier one has found.
+
     Args:
         scene: as in `find_widest_way`.
         radius: of the body, metres.
@@ -106,8 +109,12 @@ def is_roomy(scene: Scene, radius: float, need: float) -> bool:
     Raises:
         ConfigError: if the volume has too many cells.
     """
-    found = _open_lattice(scene, radius, COARSE_M)[2]
-    return found is not None and found >= need
+
+    def make() -> np.ndarray:
+        found = _open_lattice(scene, radius, COARSE_M)[2]
+        return np.array([-math.inf if found is None else found])
+
+    return bool(kept_of_scene("widest", scene, radius, make)[0] >= need)
 
 
 def _open_lattice(scene: Scene, radius: float, cell: float) -> tuple[_Openings, int, float | None]:

@@ -19,7 +19,7 @@ from edqn_jax.config import Config
 from edqn_jax.devices.devices import quick_compiler_options
 from edqn_jax.evaluation.decoder import metres_of, predicted_distance
 from edqn_jax.evaluation.trajectories import ATTITUDE, POSITION, VELOCITY, actions_of, columns_of, directions
-from edqn_jax.kept_programs import named, place_of, without_seed
+from edqn_jax.kept_programs import kept_jit, named, place_of, without_seed
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import fresh_policy
@@ -189,12 +189,16 @@ def start_poses(config: Config, trajectory: Mapping[str, np.ndarray]) -> tuple[n
     dt, first = config.drone.physics_dt_s, np.zeros(1, int)
     steps = np.array(sensor.frame_steps(config)) - config.drone.physics_steps
     (moved,), (quaternion,) = trajectory_poses(trajectory, first)
-    body = drone.hover_state(
-        jnp.asarray(moved - dt * columns_of(trajectory, VELOCITY)[0]), drone.yaw_of(jnp.asarray(quaternion))
-    )
-    here = repeat_pose(body, len(steps))
+    start = moved - np.float32(dt) * columns_of(trajectory, VELOCITY)[0].astype(np.float32)
+    here = _at_rest(start, quaternion, len(steps))
     times = np.asarray(trajectory["t"])[0] + dt * (steps - 1.0)
     return tuple(np.asarray(leaf, np.float32)[None] for leaf in (here.position, here.quaternion, times))
+
+
+@kept_jit(2)
+def _at_rest(position: Array, quaternion: Array, count: int) -> Flight:
+    """Returns `count` times the pose of a drone at rest at `position` [3], with the heading of `quaternion` [4]."""
+    return repeat_pose(drone.hover_state(position, drone.yaw_of(quaternion)), count)
 
 
 def trajectory_poses(trajectory: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -225,13 +229,19 @@ def own_motions(config: Config, trajectory: Mapping[str, np.ndarray], rows: np.n
         trajectory_poses(trajectory, last),
         trajectory_poses(trajectory, np.maximum(last - 1, 0)),
     )
-    yaw = drone.yaw_of(jnp.asarray(now))
-    rate = drone.wrap_angle(yaw - drone.yaw_of(jnp.asarray(before))) / config.drone.physics_dt_s
-    velocity = jnp.asarray(columns_of(trajectory, VELOCITY)[last])
+    velocity = columns_of(trajectory, VELOCITY)[last].astype(np.float32)
+    actions = np.asarray(actions_of(trajectory)[last], np.float32)
+    return np.asarray(_motions(config, place, now, before, velocity, actions), np.float32)
+
+
+@kept_jit(0)
+def _motions(config: Config, place: Array, now: Array, before: Array, velocity: Array, actions: Array) -> Array:
+    """Returns own motions [D, MOTION_SIZE] of poses, attitudes now and a physics step before, velocities, actions."""
+    yaw = drone.yaw_of(now)
+    rate = drone.wrap_angle(yaw - drone.yaw_of(before)) / config.drone.physics_dt_s
     ahead = heading_velocity(config.env, yaw, velocity)
-    after = Flight(jnp.asarray(place), jnp.asarray(now), velocity)
-    commanded = directions(config, after, actions_of(trajectory)[last])
-    return np.asarray(jnp.concatenate([ahead, rate[:, None], commanded], axis=-1), np.float32)
+    commanded = directions(config, Flight(place, now, velocity), actions)
+    return jnp.concatenate([ahead, rate[:, None], commanded], axis=-1)
 
 
 def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, ...]:

@@ -119,12 +119,14 @@ class TrainingSetup:
             distances = geodesic.distance_fields(worlds[0].pool, config.drone.body_radius_m)
             worlds = [dataclasses.replace(world, distances=distances) for world in worlds]
         self.trainer = Trainer(config, worlds[0] if agents is None else worlds, self.devices)
+        # A run that is continued needs no first state, and mostly has its chunk kept.
+        compile_first = None if self.trainer.is_kept() else self.trainer.trace_first(start)
         check_fits(self.trainer.shapes(), [each for each in self.devices if each in jax.local_devices()])
         self.mesh = Mesh(np.asarray(self.devices), ("mission",))
         display.phase("compiling")
-        began = time.perf_counter()
-        self.trainer.trace()
-        self._compiled = _in_background(pool, lambda: _timed(self.trainer.compile, began))
+        # Python traces one program after another, XLA compiles beside it: the longest one comes last, and has the
+        # processor for itself.
+        self._first_compiled = None if compile_first is None else _in_background(pool, compile_first)
         world, key = self._placed(self.missions[0].validation.env_params), run_streams(config.train.seed).flights
         compile_flights = rollouts.trace_missions(
             *(config, world, self._shaped_policy, key),
@@ -132,6 +134,9 @@ class TrainingSetup:
             mesh=self.mesh,
         )
         self._flights_compiled = _in_background(pool, compile_flights)
+        began = time.perf_counter()
+        self.trainer.trace()
+        self._compiled = _in_background(pool, lambda: _timed(self.trainer.compile, began))
         self._first: TrainState | None = None
         self.shortest = processes.run_synchronised(self._shortest)
 
@@ -141,6 +146,8 @@ class TrainingSetup:
         Meanwhile makes the first state, unless the run is continued.
         """
         if begins and self._first is None:
+            if self._first_compiled is not None:
+                self._first_compiled.result()
             seeds = [config.train.seed for config in self.configs]
             self._first = self.trainer.init(seeds[0] if self.trainer.agents is None else seeds, self.start)
         return self._compiled.result()

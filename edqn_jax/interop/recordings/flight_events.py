@@ -54,7 +54,7 @@ def flight_recording(
     stream = Environment(sees, env_params).stream(poses, law="esim", aim=aim)
     steps = round(config.drone.physics_dt_s * 1e6)
     actions = np.concatenate([np.asarray(action_set(config).still)[None], actions_of(trajectory)])
-    commanded = directions(config, poses, actions)
+    commanded = np.asarray(directions(config, poses, actions))
     if config.env.actions == "moves":
         moves = {"move": commanded.astype(np.int8)}
     else:
