@@ -34,6 +34,8 @@ from edqn_jax.config import Config, registry
 from edqn_jax.devices.cache import enabled_folder
 from edqn_jax.devices.kept_files import name_of, read_kept, write_kept
 from edqn_jax.native import build, shipped
+from edqn_jax.native.own_programs import own_program
+from edqn_jax.native.threefry import draw_own_in_c
 from edqn_jax.registries import Registry
 
 Given = ParamSpec("Given")
@@ -225,7 +227,9 @@ class KeptFunction(Generic[Returned]):
                 function = jax.jit(named(self._function, place.name), static_argnums=self._static)
                 devices = {device for leaf in jax.tree.leaves(given) for device in getattr(leaf, "devices", set)()}
                 on = sorted(devices, key=lambda device: device.id) or jax.local_devices()[:1]
-                [self._compiled[told_apart]] = place.load_or_compile(lambda: [function.lower(*args)], on)
+                draw_own_in_c()
+                with own_program():
+                    [self._compiled[told_apart]] = place.load_or_compile(lambda: [function.lower(*args)], on)
             return self._compiled[told_apart]
 
 

@@ -24,7 +24,8 @@ import jax
 from edqn_jax.devices.cache import private_folder
 from edqn_jax.native import shipped
 
-_ONE_AT_A_TIME = threading.Lock()
+_loading: dict[Path, threading.Lock] = {}
+"""By source: each is compiled once, several are at once, and who needs a small one does not wait for a large one."""
 
 _SHIPPED_SOURCES = tuple(Path(__file__).parents[1] / source for source in shipped.SOURCES)
 
@@ -132,7 +133,7 @@ def ensure_registered(
         by: compiler.
         headers: that the source includes from beside it.
     """
-    with _ONE_AT_A_TIME:
+    with _loading.setdefault(source, threading.Lock()):
         found = _registered(source, targets, definitions, by, headers)
         if found:
             _USED[Library(source, targets, definitions, by, headers)] = None

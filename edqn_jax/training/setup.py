@@ -240,14 +240,14 @@ def set_up_training(
 def _load_libraries(config: Config, devices: int) -> None:
     """Has what the program of a training calls in C or CUDA compiled, unless it is kept."""
     on_cpu = jax.default_backend() == "cpu"
-    drawing.is_available("cpu" if on_cpu else "cuda")
-    products.precision_of(config.train.products)
-    if on_cpu:
+    if on_cpu:  # what worlds are drawn with comes first, what compiles for seconds last
         threefry.is_available()
         patches.is_available()
         adam.is_available()
     if on_cpu and devices > 1 and jax.process_count() == 1:
         all_sum.is_available()
+    products.precision_of(config.train.products)
+    drawing.is_available("cpu" if on_cpu else "cuda")
 
 
 def _in_background(pool: Executor, work: Callable[[], Made]) -> Future[Made]:
