@@ -94,3 +94,11 @@ def test_the_programs_used_longest_ago_go_once_there_are_too_many_bytes(tmp_path
     assert len(list((tmp_path / "folder").iterdir())) == 6
     cache._make_room(tmp_path, 599)
     assert sorted(file.name for file in (tmp_path / "folder").iterdir()) == ["4", "5"]
+
+
+def test_room_is_made_once_in_a_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[Path] = []
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(cache, "_make_room", lambda folder, _: looked.append(folder))
+    first = cache.private_folder()
+    assert first is not None and cache.private_folder() == first and looked == [first]

@@ -13,6 +13,7 @@ import pytest
 from edqn_jax.cli.train import options_to_compare, parse_train
 from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
+from edqn_jax.sim.camera import camera
 from tests.support.processes import WORLD
 
 
@@ -51,6 +52,18 @@ def test_processes_may_keep_a_world_file_in_different_folders_but_not_another_wo
         here = said("here", WORLD, *words)
         assert said("there", WORLD, *words) == here
         assert said("elsewhere", WORLD.replace('pos="10 15 5"', 'pos="11 15 5"'), *words) != here
+
+
+@pytest.mark.parametrize(("count", "draws"), [(1, []), (2, [True, False])])
+def test_of_several_processes_all_must_draw_in_c_or_none_and_one_does_not_wait_for_the_compiler(
+    count: int, draws: list[bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = list(draws)
+    monkeypatch.setattr(jax, "process_count", lambda: count)
+    monkeypatch.setattr(camera.native, "is_available", lambda _: asked.pop(0))
+    config = parse_train(["--tuned-for", "cpu"])[1]
+    first, second = (options_to_compare(config) for _ in range(2))
+    assert (first == second) is (count == 1) and not asked
 
 
 @pytest.fixture

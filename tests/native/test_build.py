@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -67,6 +69,30 @@ def test_what_is_compiled_once_is_kept(source: Path, tmp_path: Path) -> None:
         build._registered.cache_clear()
         assert ensure_registered(source, names, ("NAME=edqn_test_e",))
         assert kept(tmp_path) == [first] and first.stat().st_mtime_ns == made
+
+
+def test_who_needs_one_library_does_not_wait_for_another(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, may_end = threading.Event(), threading.Event()
+
+    def registered(of: Path, *_: object) -> bool:
+        if of == source:
+            begun.set()
+            return may_end.wait(60)
+        return True
+
+    monkeypatch.setattr(build, "_registered", registered)
+    monkeypatch.setattr(build, "_USED", {})
+    with ThreadPoolExecutor(2) as pool:
+        large = pool.submit(ensure_registered, source, ("edqn_test_large",))
+        assert begun.wait(60)
+        try:
+            small = pool.submit(ensure_registered, tmp_path / "other.c", ("edqn_test_small",))
+            assert small.result(60) and not large.done()
+        finally:
+            may_end.set()
+        assert large.result(60)
 
 
 def test_where_nothing_can_be_kept_it_is_compiled_and_leaves_nothing(

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import shutil
+import threading
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
+import pytest
 from jax.sharding import Mesh
 
 from edqn_jax.evaluation import rollouts
@@ -16,6 +21,7 @@ from edqn_jax.learn.perception import patches
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.native import adam, threefry
+from edqn_jax.native.own_programs import own_program
 from tests.support.configs import TINY
 from tests.support.miniature import miniature_world
 
@@ -42,3 +48,45 @@ def test_flights_of_the_agent_draw_and_cut_in_c() -> None:
     begin, fly_on, _ = rollouts._lower(Place(None), program, mesh, world, params, jax.random.key(0))
     found = [done_in_c(each) for each in (begin, fly_on)]
     assert [any(each) for each in zip(*found, strict=True)] == [HAS_COMPILER, HAS_COMPILER, False]
+
+
+def test_the_first_state_is_made_on_one_device_and_draws_in_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = []
+
+    def compiled(place: Place, trace: Callable[[], list[jax.stages.Lowered]], devices: list[Any]) -> object:
+        found.append((trace()[0], devices))
+        return [lambda *_: None]
+
+    monkeypatch.setattr(Place, "load_or_compile", compiled)
+    Trainer(CONFIG, miniature_world(CONFIG), jax.devices()[:2]).trace_first()()
+    [(program, devices)] = found
+    assert devices == jax.devices()[:1] and done_in_c(program)[0] is HAS_COMPILER
+
+
+def test_no_garbage_is_collected_while_programs_are_traced_and_it_is_afterwards() -> None:
+    assert gc.isenabled()
+    inside, others_done = threading.Event(), threading.Event()
+
+    def another() -> None:
+        with own_program():
+            inside.set()
+            others_done.wait(60)
+
+    thread = threading.Thread(target=another)
+    with own_program():
+        thread.start()
+        assert inside.wait(60) and not gc.isenabled()
+    still_off = not gc.isenabled()  # another thread traces on
+    others_done.set()
+    thread.join(60)
+    assert still_off and gc.isenabled()
+
+
+def test_collection_that_was_off_stays_off() -> None:
+    gc.disable()
+    try:
+        with own_program(), own_program():
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
+from edqn_jax.devices import cache
 from edqn_jax.errors import ConfigError
+from edqn_jax.planning import free_space, widest
 from edqn_jax.planning.astar import shortest_path
-from edqn_jax.planning.free_space import find_reachable
+from edqn_jax.planning.free_space import find_reachable, kept_reachable
 from edqn_jax.planning.lattice import NoPathError
+from edqn_jax.planning.widest import is_roomy
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.scene.scene import Shape, stack_scenes
 from edqn_jax.sim.task.missions import spread_missions
@@ -111,3 +115,21 @@ def test_missions_begin_where_there_is_a_way(own: float) -> None:
     assert np.ptp(starts, axis=0).min() > 2.0 and len(np.unique(starts[:, 0])) > 200
     everywhere = spread_missions(stack_scenes([scene]), 256, own, 3.0, jax.random.key(0))
     assert np.asarray(everywhere.start)[:, 0].min() < 5.9
+
+
+def test_what_a_command_has_searched_the_next_one_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "_enabled", [tmp_path])
+    scene = small_world(*enclosure((3.0, 3.0, 3.0)), goal=tuple(GOAL)).scene
+    first, roomy = kept_reachable(scene, RADIUS), is_roomy(scene, RADIUS, 0.5)
+    plain = find_reachable(scene, RADIUS)
+    for name in ("is_way", "corner", "edge_m", "lost"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(plain, name))
+    assert first.lost > 0
+    monkeypatch.setattr(free_space, "find_reachable", None)
+    monkeypatch.setattr(widest, "_open_lattice", None)
+    again = kept_reachable(scene, RADIUS)
+    assert again.is_way.dtype == bool and is_roomy(scene, RADIUS, 0.5) == roomy
+    for name in ("is_way", "corner", "edge_m", "lost"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    with pytest.raises(TypeError):  # of another body it is searched anew
+        kept_reachable(scene, RADIUS / 2)
