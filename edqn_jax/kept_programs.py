@@ -208,12 +208,14 @@ class KeptFunction(Generic[Returned]):
         bound = self._signature.bind(*args, **kwargs)
         bound.apply_defaults()
         args = bound.args  # one program, however the arguments are given
-        if enabled_folder() is None:
-            return self._traced(*args)
         given = [arg for number, arg in enumerate(args) if number not in self._static]
         leaves, form = jax.tree.flatten(given)
         if any(isinstance(leaf, Tracer) for leaf in leaves):
             return self._traced(*args)
+        draw_own_in_c()
+        if enabled_folder() is None:
+            with own_program():
+                return self._traced(*args)
         static = tuple(arg for number, arg in enumerate(args) if number in self._static)
         told_apart = static, form, tuple(map(_kind_of, leaves))
         compiled = self._compiled.get(told_apart) or self._compile(told_apart, static, given, args)
@@ -227,7 +229,6 @@ class KeptFunction(Generic[Returned]):
                 function = jax.jit(named(self._function, place.name), static_argnums=self._static)
                 devices = {device for leaf in jax.tree.leaves(given) for device in getattr(leaf, "devices", set)()}
                 on = sorted(devices, key=lambda device: device.id) or jax.local_devices()[:1]
-                draw_own_in_c()
                 with own_program():
                     [self._compiled[told_apart]] = place.load_or_compile(lambda: [function.lower(*args)], on)
             return self._compiled[told_apart]
