@@ -16,8 +16,8 @@ memory, and two controls: `blind`, which sees nothing, and `depth`, the truth. T
             cast shadows, flown in both; rooms have ceilings, so that with shadows all of them is in the shade; flown
             without the sun's shading in full light, and in a hundredth of the light with it, too
     turning the camera on the body, 64 x 48 pixels, at 8 and 12 m/s among trunks, in 50 to 500 lux
-    fine    as turning, at 8 m/s among thin trunks and wires, with 64 x 48 and with 128 x 96 pixels; true depth is that of
-            a ray through each pixel's middle, which passes by what is thinner than a pixel
+    fine    as turning, at 8 m/s among thin trunks and wires, with 64 x 48 and with 128 x 96 pixels; true depth is that
+            of a ray through each pixel's middle, which passes by what is thinner than a pixel
     bytes   nothing is trained: the events of flights against frames, in bytes a second
 
     python benchmarks/worth.py --axis looks --out runs/worth -- --total-steps 20000000
