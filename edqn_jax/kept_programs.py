@@ -294,11 +294,12 @@ def _surroundings() -> tuple[str]:
     settings = {name: value for name, value in os.environ.items() if name.startswith(("JAX_", "XLA_"))}
     compilers = [build.compiler_version(), os.environ.get(shipped.SWITCH)]
     devices = [(device.platform, device.device_kind, device.id) for device in jax.devices()]
-    return (repr((sorted(settings.items()), compilers, devices, _versions())),)
+    return (repr((sorted(settings.items()), compilers, devices, versions())),)
 
 
 @functools.cache
-def _versions() -> list[str]:
+def versions() -> list[str]:
+    """Returns the versions of Python and of the libraries that compute."""
     return [platform.python_version(), *map(metadata.version, DEPENDENCIES)]
 
 

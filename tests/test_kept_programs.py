@@ -17,7 +17,8 @@ import pytest
 from edqn_jax import kept_programs, user_code
 from edqn_jax.config import registry
 from edqn_jax.devices import cache
-from edqn_jax.kept_programs import Place, place_of
+from edqn_jax.kept_programs import Place, kept_jit, place_of
+from edqn_jax.native.own_programs import is_own_program
 from edqn_jax.registries import Registry
 
 ARGUMENTS = (jnp.arange(3.0), {"keys": jax.random.split(jax.random.key(0), 2)})
@@ -220,3 +221,20 @@ def test_what_only_tracing_needs_is_not_imported_before() -> None:
     )
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert said == "[]\n"
+
+
+def test_kept_functions_are_lowered_as_the_packages_own_and_others_with_them_are_not(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own: list[bool] = []
+
+    def noted(values: jax.Array) -> jax.Array:
+        own.append(is_own_program())
+        return values + 1
+
+    kept_jit()(noted)(jnp.arange(3.0))
+    within = kept_jit()(noted)
+    jax.jit(lambda values: within(values))(jnp.arange(4.0))
+    monkeypatch.setattr(cache, "_enabled", [])
+    kept_jit()(noted)(jnp.arange(5.0))
+    assert own == [True, False, True]

@@ -62,7 +62,7 @@ def host_bytes(limits: Sequence[Path] = LIMITS) -> int | None:
 
 
 def check_fits(state: Any, devices: Sequence[Any]) -> None:
-    """Raises if a train state is larger than the free memory of a device; each holds all of it while it is made.
+    """Raises if a train state is larger than the free memory of the device that makes it, before it is cut.
 
     Temporaries need more, so a state that passes may still be too large.
 

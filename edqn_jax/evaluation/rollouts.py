@@ -22,7 +22,7 @@ from edqn_jax.evaluation import decoder
 from edqn_jax.kept_programs import Place, named, place_of, without_seed
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
-from edqn_jax.native.own_programs import own_program
+from edqn_jax.native.own_programs import own_program, without_collection
 from edqn_jax.native.threefry import draw_own_in_c
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task import group
@@ -230,7 +230,7 @@ def _lower(
 ) -> list[jax.stages.Lowered]:
     begin, fly_on, end = _programs(mesh, place.name)
     draw_own_in_c()
-    with own_program():
+    with own_program(), without_collection():
         first = begin.trace(program, env_params, params, key)
         flying = jax.tree.map(
             lambda leaf, layout: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=layout),

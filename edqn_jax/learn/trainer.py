@@ -29,7 +29,7 @@ from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import Episodes, Losses, TrainState, init_state
 from edqn_jax.learn.step import run_steps
 from edqn_jax.learn.updates import begin_networks
-from edqn_jax.native.own_programs import own_program
+from edqn_jax.native.own_programs import own_program, without_collection
 from edqn_jax.native.threefry import draw_own_in_c
 from edqn_jax.sim.task.env import EnvParams
 
@@ -42,13 +42,16 @@ def _with_sharding(shapes: Any, sharding: NamedSharding) -> Any:
 
 
 def _cut(whole: Array, laid_out: jax.ShapeDtypeStruct) -> Array:
-    """Returns an array that this process has, laid out over the devices of all; `whole` is deleted."""
+    """Returns an array that one device of this process has, laid out over the devices of all; `whole` is used up."""
+    assert laid_out.sharding is not None
+    if laid_out.sharding.num_devices == 1:
+        return jax.device_put(whole, laid_out.sharding)
     if jnp.issubdtype(whole.dtype, jax.dtypes.prng_key):
         return jax.jit(jax.random.wrap_key_data, out_shardings=laid_out.sharding)(
             np.asarray(jax.random.key_data(whole))
         )
-    values = np.asarray(whole)  # through the host: JAX cannot move what one device has to another process
-    assert laid_out.sharding is not None
+    # Through the host: JAX cannot move what one device has to another process, and would compile a cut for each shape.
+    values = np.asarray(whole)
     cut = jax.make_array_from_callback(whole.shape, laid_out.sharding, lambda index: values[index])
     whole.delete()
     return cut
@@ -86,12 +89,12 @@ class Trainer:
         self._place: Place | None = None
         self._traced: jax.stages.Lowered | None = None
         self._shapes: TrainState | None = None
-        self._first: tuple[Policy | None, Callable[[Array], TrainState]] | None = None
+        self._make_first: tuple[Policy | None, Callable[[Array], TrainState]] | None = None
         self._chunk = None
         draw_own_in_c()
 
     def trace_first(self, start: Policy | None = None) -> Callable[[], None]:
-        """Traces what makes the first state, unless it is kept, and returns what compiles it; `init` then does neither.
+        """Traces what makes the first state, unless it is kept, and returns what compiles it, for the next `init`.
 
         Args:
             start: as of `init`.
@@ -113,7 +116,7 @@ class Trainer:
         place = Place(None) if start is not None else self._place_of("first_state", arguments, [device])
 
         def lower() -> list[jax.stages.Lowered]:
-            with own_program():
+            with own_program(), without_collection():
                 traced = jax.jit(named(self._each(begin, 0), place.name)).trace(*arguments)
                 self._shapes = self._shapes or self._laid_out(traced.out_info)
                 return [traced.lower()]
@@ -122,7 +125,7 @@ class Trainer:
 
         def compile_first() -> None:
             [make] = place.load_or_compile(lambda: lowered or lower(), [device])
-            self._first = start, partial(make, world)
+            self._make_first = start, partial(make, world)
 
         return compile_first
 
@@ -136,12 +139,13 @@ class Trainer:
         Raises:
             ConfigError: if its networks have other shapes, or the learner cannot begin with any.
         """
-        if self._first is None or self._first[0] is not start:
+        if self._make_first is None or self._make_first[0] is not start:
             self.trace_first(start)()
-        assert self._first is not None
+        assert self._make_first is not None
+        (_, make), self._make_first = self._make_first, None  # it may hold parameters
         keys = self._keys([seed] if isinstance(seed, int) else seed)
         # Made whole, by each process on one device, and then cut: made in parts it would be rounded otherwise.
-        return jax.tree.map(_cut, self._first[1](keys), self.shapes())
+        return jax.tree.map(_cut, make(keys), self.shapes())
 
     def _own_device(self) -> jax.Device:  # pyright: ignore[reportInvalidTypeForm]
         """Returns the first of this process's devices."""
@@ -222,11 +226,6 @@ class Trainer:
         if self._chunk is None and self._traced is None:
             self._traced = self._lower()
 
-    def is_kept(self) -> bool:
-        """Returns whether an earlier command has kept the chunk, so that nothing is traced."""
-        self._load()
-        return self._chunk is not None
-
     def _load(self) -> None:
         """Loads the chunk if it is kept. The shapes of states follow from the configuration, and need not be known."""
         if self._place is None and not self.config.train.debug:
@@ -254,7 +253,7 @@ class Trainer:
         )
         assert self._place is not None
         program = jax.jit(named(run, self._place.name), donate_argnums=1)
-        with own_program():
+        with own_program(), without_collection():
             return program.lower(self.env_params, self.shapes(), self._steps(0))
 
     def _steps(self, first: int) -> Array:

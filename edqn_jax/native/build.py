@@ -25,7 +25,9 @@ from edqn_jax.devices.cache import private_folder
 from edqn_jax.native import shipped
 
 _loading: dict[Path, threading.Lock] = {}
-"""By source: each is compiled once, several are at once, and who needs a small one does not wait for a large one."""
+"""By source: each is compiled once, several at a time, and who needs a small one does not wait for a large one."""
+
+_registering = threading.Lock()  # JAX makes a capsule with types that it sets on what all threads share
 
 _SHIPPED_SOURCES = tuple(Path(__file__).parents[1] / source for source in shipped.SOURCES)
 
@@ -174,9 +176,10 @@ def _register(load: Callable[[], ctypes.CDLL], source: Path, targets: tuple[str,
     try:
         library = load()
         _check_usable(library, source)
-        for target in targets:
-            handler = jax.ffi.pycapsule(getattr(library, target))
-            jax.ffi.register_ffi_target(target, handler, platform=by.platform)
+        with _registering:
+            for target in targets:
+                handler = jax.ffi.pycapsule(getattr(library, target))
+                jax.ffi.register_ffi_target(target, handler, platform=by.platform)
     except (OSError, AttributeError, subprocess.SubprocessError, jax.errors.JaxRuntimeError) as error:
         said = error.stderr.decode(errors="replace") if isinstance(error, subprocess.CalledProcessError) else str(error)
         first = next(iter(said.strip().splitlines()), type(error).__name__)

@@ -22,20 +22,21 @@ _pauses: list[bool] = []  # of each pause that lasts, whether there was garbage 
 def own_program() -> Iterator[None]:
     """Has what is traced and lowered within taken for a program of the package's own.
 
-    What `jax.jit` has traced or lowered before is not done again, and stays as it is. Python collects no garbage
-    meanwhile, in any thread: it would walk over all that JAX holds again and again, a fifth of the time.
+    What `jax.jit` has traced or lowered before is not done again, and stays as it is.
     """
     token = _IS_OWN.set(True)
     try:
-        with _without_collection():
-            yield
+        yield
     finally:
         _IS_OWN.reset(token)
 
 
 @contextlib.contextmanager
-def _without_collection() -> Iterator[None]:
-    """Pauses garbage collection until the last of those that overlap ends; what was off before stays off."""
+def without_collection() -> Iterator[None]:
+    """Pauses garbage collection, in all threads, until the last of those that overlap ends; what was off stays off.
+
+    While a large program is traced, Python would walk over all that JAX holds again and again, a fifth of the time.
+    """
     with _lock:
         _pauses.append(gc.isenabled() or any(_pauses))
         gc.disable()

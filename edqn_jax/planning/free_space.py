@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import scipy
@@ -76,11 +77,14 @@ def kept_reachable(scene: Scene, radius: float) -> Reachable:
 
     def make() -> np.ndarray:
         found = find_reachable(scene, radius)
-        return np.concatenate([found.corner, [found.edge_m, found.lost], found.is_way.shape, found.is_way.ravel()])
+        numbers = np.array([*found.corner, found.edge_m, found.lost, *found.is_way.shape], np.float64)
+        return np.concatenate([numbers.view(np.uint8), np.packbits(found.is_way)])
 
     kept = kept_of_scene("reachable", scene, radius, make)
-    shape = kept[5:8].astype(int)
-    return Reachable(kept[8:].reshape(shape).astype(bool), kept[:3], float(kept[3]), float(kept[4]))
+    numbers = kept[: 8 * np.dtype(np.float64).itemsize].copy().view(np.float64)
+    shape = tuple(numbers[5:].astype(int))
+    is_way = np.unpackbits(kept[numbers.nbytes :], count=math.prod(shape)).astype(bool).reshape(shape)
+    return Reachable(is_way, numbers[:3], float(numbers[3]), float(numbers[4]))
 
 
 def is_reachable(found: Reachable, point: np.ndarray | Array) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.devices.kept_files import kept_array, name_of
-from edqn_jax.kept_programs import digest_of_package, folder_without_user_code
+from edqn_jax.kept_programs import digest_of_package, folder_without_user_code, versions
 from edqn_jax.sim.scene.scene import Scene
 
 
@@ -24,6 +24,7 @@ def kept_of_scene(kind: str, scene: Scene, radius: float, make: Callable[[], NDA
         make: returns it; its errors are not kept.
     """
     leaves, form = jax.tree.flatten(scene)
-    told_apart = f"{form} {radius} {[leaf.shape for leaf in leaves]} {digest_of_package()}"
+    here = jax.default_backend(), versions(), digest_of_package()
+    told_apart = f"{form} {float(radius)!r} {[leaf.shape for leaf in leaves]} {here}"
     name = name_of(told_apart.encode(), *(np.asarray(leaf).tobytes() for leaf in leaves))
     return kept_array(folder_without_user_code(), f"{kind}-{name}", make)

@@ -231,7 +231,7 @@ def own_motions(config: Config, trajectory: Mapping[str, np.ndarray], rows: np.n
     )
     velocity = columns_of(trajectory, VELOCITY)[last].astype(np.float32)
     actions = np.asarray(actions_of(trajectory)[last], np.float32)
-    return np.asarray(_motions(config, place, now, before, velocity, actions), np.float32)
+    return np.asarray(_motions(without_seed(config), place, now, before, velocity, actions), np.float32)
 
 
 @kept_jit(0)

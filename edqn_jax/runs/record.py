@@ -85,7 +85,8 @@ def train_run(
         DivergedError: as `train`; the policy of the last checkpoint stays.
         StoppedError: after saving the policy, if it was asked to.
     """
-    with lock_run(run), set_up_training(config, reward, progress, agents=seeds, start=start) as preparation:
+    begins = run is None or run.resume == "never"
+    with lock_run(run), set_up_training(config, reward, progress, seeds, start, begins) as preparation:
         progress.message(messages.describe_start(preparation, seeds))
         folders = [run if run is None or seeds is None else run.of_seed(c.train.seed) for c in preparation.configs]
         keeper = Checkpointer(preparation, run, folders, reward, progress.message)

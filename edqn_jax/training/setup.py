@@ -82,10 +82,12 @@ class TrainingSetup:
         pool: Executor,
         agents: int | None,
         start: Policy | None,
+        begins: bool,
     ) -> None:
         """Compiles in the background while the shortest path is searched.
 
-        Programs are traced one after the other: several threads of Python would only wait for one another.
+        Programs are traced one after the other: several threads of Python would only wait for one another. Where what
+        is kept cannot be loaded, they are traced beside one another.
 
         Raises:
             ConfigError: if the configuration is invalid, the world cannot be flown, or memory is too small.
@@ -109,7 +111,7 @@ class TrainingSetup:
         self.start = start
         display.phase("preparing worlds")
         self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)
-        # Where they are not kept, compilers need no Python, and worlds no libraries. Who calls one finds its errors.
+        # Where they are not kept, compilers need no Python, worlds one small library. Who calls one finds its errors.
         pool.submit(_load_libraries, config, len(self.devices))
         # A world's file may be missing on one host.
         self.missions = processes.run_synchronised(lambda: missions_of_runs(self.configs, reward))
@@ -119,9 +121,8 @@ class TrainingSetup:
             distances = geodesic.distance_fields(worlds[0].pool, config.drone.body_radius_m)
             worlds = [dataclasses.replace(world, distances=distances) for world in worlds]
         self.trainer = Trainer(config, worlds[0] if agents is None else worlds, self.devices)
-        # A run that is continued needs no first state, and mostly has its chunk kept.
-        compile_first = None if self.trainer.is_kept() else self.trainer.trace_first(start)
-        check_fits(self.trainer.shapes(), [each for each in self.devices if each in jax.local_devices()])
+        compile_first = self.trainer.trace_first(start) if begins else None
+        check_fits(self.trainer.shapes(), [each for each in self.devices if each in jax.local_devices()][:1])
         self.mesh = Mesh(np.asarray(self.devices), ("mission",))
         display.phase("compiling")
         # Python traces one program after another, XLA compiles beside it: the longest one comes last, and has the
@@ -215,6 +216,7 @@ def set_up_training(
     display: Display | None = None,
     agents: int | None = None,
     start: Policy | None = None,
+    begins: bool = True,
 ) -> Iterator[TrainingSetup]:
     """Prepares a run; pending compilations are cancelled if the block ends with an error.
 
@@ -224,6 +226,7 @@ def set_up_training(
         display: of the progress.
         agents: how many are trained in one program; None is one, compiled as such.
         start: policy whose networks they begin with.
+        begins: whether a first state will be needed, as far as it is known: what makes it is then compiled ahead.
 
     Raises:
         ConfigError: if the configuration is invalid or the world cannot be flown, or the process was forked after JAX
@@ -232,7 +235,7 @@ def set_up_training(
     check_not_forked()
     pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling", initializer=keep_tested_settings)
     try:
-        yield TrainingSetup(config, reward, display or Silent(), pool, agents, start)
+        yield TrainingSetup(config, reward, display or Silent(), pool, agents, start, begins)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 

@@ -19,9 +19,10 @@ from edqn_jax.kept_programs import Place
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.perception import patches
 from edqn_jax.learn.policy import fresh_policy
+from edqn_jax.learn.step import train_step
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.native import adam, threefry
-from edqn_jax.native.own_programs import own_program
+from edqn_jax.native.own_programs import without_collection
 from tests.support.configs import TINY
 from tests.support.miniature import miniature_world
 
@@ -63,17 +64,17 @@ def test_the_first_state_is_made_on_one_device_and_draws_in_c(monkeypatch: pytes
     assert devices == jax.devices()[:1] and done_in_c(program)[0] is HAS_COMPILER
 
 
-def test_no_garbage_is_collected_while_programs_are_traced_and_it_is_afterwards() -> None:
+def test_no_garbage_is_collected_until_the_last_of_those_that_trace_has_ended() -> None:
     assert gc.isenabled()
     inside, others_done = threading.Event(), threading.Event()
 
     def another() -> None:
-        with own_program():
+        with without_collection():
             inside.set()
             others_done.wait(60)
 
     thread = threading.Thread(target=another)
-    with own_program():
+    with without_collection():
         thread.start()
         assert inside.wait(60) and not gc.isenabled()
     still_off = not gc.isenabled()  # another thread traces on
@@ -85,8 +86,20 @@ def test_no_garbage_is_collected_while_programs_are_traced_and_it_is_afterwards(
 def test_collection_that_was_off_stays_off() -> None:
     gc.disable()
     try:
-        with own_program(), own_program():
+        with without_collection(), without_collection():
             pass
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_large_programs_are_traced_without_collection(monkeypatch: pytest.MonkeyPatch) -> None:
+    collects = []
+
+    def step(*args: Any) -> Any:
+        collects.append(gc.isenabled())
+        return train_step(*args)
+
+    monkeypatch.setattr("edqn_jax.learn.step.train_step", step)
+    Trainer(CONFIG, miniature_world(CONFIG), jax.devices()[:1]).trace()
+    assert collects == [False] and gc.isenabled()

@@ -119,7 +119,7 @@ def test_missions_begin_where_there_is_a_way(own: float) -> None:
 
 def test_what_a_command_has_searched_the_next_one_finds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cache, "_enabled", [tmp_path])
-    scene = small_world(*enclosure((3.0, 3.0, 3.0)), goal=tuple(GOAL)).scene
+    scene = small_world(*enclosure((4.0, 4.0, 3.0)), goal=tuple(GOAL)).scene
     first, roomy = kept_reachable(scene, RADIUS), is_roomy(scene, RADIUS, 0.5)
     plain = find_reachable(scene, RADIUS)
     for name in ("is_way", "corner", "edge_m", "lost"):
@@ -129,7 +129,9 @@ def test_what_a_command_has_searched_the_next_one_finds(tmp_path: Path, monkeypa
     monkeypatch.setattr(widest, "_open_lattice", None)
     again = kept_reachable(scene, RADIUS)
     assert again.is_way.dtype == bool and is_roomy(scene, RADIUS, 0.5) == roomy
+    assert is_roomy(scene, RADIUS, -1.0) and not is_roomy(scene, RADIUS, 100.0)  # the width is kept, not the answer
     for name in ("is_way", "corner", "edge_m", "lost"):
         np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
-    with pytest.raises(TypeError):  # of another body it is searched anew
-        kept_reachable(scene, RADIUS / 2)
+    for other in ((scene, RADIUS / 2), (small_world(goal=tuple(GOAL)).scene, RADIUS)):
+        with pytest.raises(TypeError):  # of another body, and in another world, it is searched anew
+            kept_reachable(*other)
