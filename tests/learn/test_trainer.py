@@ -376,3 +376,16 @@ def _told(trained: tuple) -> tuple:
 def _same(one, two) -> bool:
     pairs = zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True)
     return all(np.array_equal(a, b) for a, b in pairs)
+
+
+@pytest.mark.slow
+def test_what_makes_the_first_state_is_compiled_ahead_and_used_once(
+    world: EnvParams, on_two, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = Trainer(TINY, world, jax.devices()[:2])
+    made.trace_first()()
+    monkeypatch.setattr(made, "trace_first", None)
+    for one, two in zip(jax.tree.leaves(_host(made.init(TINY.train.seed))), jax.tree.leaves(on_two[0][0]), strict=True):
+        np.testing.assert_array_equal(one, two)
+    with pytest.raises(TypeError):  # it may hold parameters, and is not held on to
+        made.init(TINY.train.seed)

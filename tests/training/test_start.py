@@ -21,6 +21,7 @@ from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.learn.qnetwork import network_values
+from edqn_jax.learn.trainer import Trainer
 from edqn_jax.learn.updates import Networks, begin_networks, init_networks
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from edqn_jax.training.setup import set_up_training
@@ -127,3 +128,22 @@ def test_the_command_takes_the_policys_options_and_flags_change_them() -> None:
     with pytest.raises(edqn_jax.ConfigError, match="did you mean 'pretrained'"):
         parse_train(["--start-from", "pretraind"])
     assert config.agent.exploration_start == 0.1
+
+
+@pytest.mark.parametrize("begins", [True, False])
+def test_what_makes_a_first_state_is_traced_where_one_will_be_needed(
+    begins: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Traced(Exception):
+        """The first state, ahead of the chunk."""
+
+    class NotTraced(Exception):
+        """What comes next was reached without it."""
+
+    def stop(error: type[Exception]) -> None:
+        raise error
+
+    monkeypatch.setattr(Trainer, "trace_first", lambda *_: stop(Traced))
+    monkeypatch.setattr(Trainer, "shapes", lambda *_: stop(NotTraced))
+    with pytest.raises(Traced if begins else NotTraced), set_up_training(SMALL, begins=begins):
+        pass
