@@ -11,7 +11,7 @@ from edqn_jax.config import Config, ExposureConfig
 
 Layer = Mapping[str, Mapping[str, Any]]
 
-BLIND, DEPTH = "blind", "depth"
+CONTROLS = BLIND, DEPTH = "blind", "depth"
 """Controls that every axis has beside its sensors: what a policy comes to that sees nothing, or the truth."""
 
 FRAMES = ("frames", "frame-pair", "frame-difference")
@@ -81,10 +81,10 @@ class Axis:
     """By condition: what is otherwise than in training. A comma parts it into column and row of the figure."""
     flags: Sequence[str] = ()
     """Options of all rows."""
-    same_trained: bool = False
-    """Whether the controls see nothing of what differs between conditions of training, and are trained in one."""
+    same_trained: Sequence[str] = ()
+    """Controls that see nothing of what differs between conditions of training, and are trained in one."""
     same_flown: bool = False
-    """Likewise of the conditions that are flown."""
+    """Whether the controls see nothing of what differs between the conditions that are flown."""
     controls: str | None = None
     """Another axis, of the same task, whose rows of the controls are this one's, which has none."""
 
@@ -115,7 +115,7 @@ AXES: dict[str, Axis] = {
         {look: ("--surface.pattern", look) for look in LOOKS[:2]},
         dict.fromkeys((BLIND, DEPTH, "events", *FRAMES), ()),
         {look: {"surface": {"pattern": look}} for look in LOOKS},
-        same_trained=True,
+        same_trained=CONTROLS,
         same_flown=True,
     ),
     "age": Axis(
@@ -153,7 +153,7 @@ AXES: dict[str, Axis] = {
             *("--surface.pattern", "plaid", "--camera.ambient", str(SHADE)),
             *("--light.least-lux", str(SUNNY_LUX), "--light.most-lux", str(SUNNY_LUX)),
         ),
-        same_trained=True,
+        same_trained=CONTROLS,
         same_flown=True,
     ),
     "turning": Axis(
@@ -169,7 +169,7 @@ AXES: dict[str, Axis] = {
         same_flown=True,
     ),
     "fine": Axis(
-        "Thin trunks and wires, coarse and fine pixels, a camera on the body at 8 m/s",
+        "Thin trunks and wires, a camera on the body",
         ("wires",),
         {
             f"{width} x {height}": ("--camera.width", str(width), "--camera.height", str(height))
@@ -181,6 +181,7 @@ AXES: dict[str, Axis] = {
             *("--camera.mount", "body", "--camera.samples-down", "3", "--env.speed-m-s", "8"),
             *("--encoder.replay-size", "65536", "--light.least-lux", "50", "--light.most-lux", "500"),
         ),
+        same_trained=(BLIND,),
         same_flown=True,
     ),
 }
@@ -210,13 +211,13 @@ def camera_of(sensor: str) -> str:
 
 def is_first_alone(axis: Axis, sensor: str) -> bool:
     """Returns whether a sensor is trained in the first condition alone, and stands for all of them."""
-    return axis.same_trained and sensor in (BLIND, DEPTH)
+    return sensor in axis.same_trained
 
 
 def flown_of(axis: Axis, sensor: str) -> dict[str, Layer]:
     """Returns the conditions in which a policy of this sensor flies; the first stands for all that it cannot tell."""
     flown = dict(axis.flown)
-    if axis.same_flown and sensor in (BLIND, DEPTH):
+    if axis.same_flown and sensor in CONTROLS:
         first = next(iter(flown))
         return {first: flown[first]}
     return flown

@@ -15,7 +15,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import bootstrap_rates, percentile_interval, rate_interval
 from measurement.intervals import difference_interval
 from worth_parts import traffic
-from worth_parts.axes import AXES, BLIND, DEPTH, FRAMES, Axis, camera_of, flown_of, is_first_alone
+from worth_parts.axes import AXES, BLIND, CONTROLS, DEPTH, FRAMES, Axis, camera_of, flown_of, is_first_alone
 
 GOAL = "1"
 """Digit of a flight that arrived."""
@@ -69,7 +69,7 @@ class Cell:
 def rivals_of(sensors: Iterable[str]) -> list[str]:
     """Returns those of an axis's sensors that are compared; see `Cell.rivals`."""
     known = list(sensors)
-    rivals = [sensor for sensor in known if sensor not in (BLIND, DEPTH)]
+    rivals = [sensor for sensor in known if sensor not in CONTROLS]
     if all(sensor.startswith(LATE) for sensor in rivals):
         return [sensor for sensor in known if sensor != BLIND]
     return [sensor for sensor in rivals if not sensor.startswith(LATE)]
@@ -85,7 +85,7 @@ def rows_of(rows: Iterable[success.Row], axis: str) -> list[success.Row]:
     known = [row for row in rows if row.get("benchmark") == "worth"]
     own = [row for row in known if row["axis"] == axis]
     if own:
-        own += [row for row in known if row["axis"] == controls and row["sensor"] in (BLIND, DEPTH)]
+        own += [row for row in known if row["axis"] == controls and row["sensor"] in CONTROLS]
     for row in own:
         newest[tuple(row.get(key) for key in ("world", "trained", "sensor", "width", "look"))] = row
     found = list(newest.values())
@@ -108,14 +108,14 @@ def cells_of(rows: Sequence[success.Row], axis: Axis) -> list[Cell]:
     first, cells = next(iter(axis.trained)), []
     for world, trained, flown in itertools.product(axis.worlds, axis.trained, axis.flown):
         arrived = {}
-        for sensor in dict.fromkeys([BLIND, DEPTH, *axis.sensors]):
+        for sensor in dict.fromkeys([*CONTROLS, *axis.sensors]):
             row = of.get((world, first if is_first_alone(axis, sensor) else trained, sensor))
             if row is None:
                 continue
             alike = next(iter(axis.flown)) if len(flown_of(axis, sensor)) == 1 else flown
             if alike in row["flown"]:
                 arrived[sensor] = np.array([[digit == GOAL for digit in seed] for seed in row["flown"][alike]])
-        if arrived.keys() - {BLIND, DEPTH} or len(axis.sensors) == len(arrived):
+        if arrived.keys() - set(CONTROLS) or len(axis.sensors) == len(arrived):
             missing = [sensor for sensor in rivals_of(axis.sensors) if sensor not in arrived]
             cells.append(Cell(world, trained, flown, arrived, missing))
     return cells
@@ -169,7 +169,7 @@ def tables(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]]) -> 
 
 def _flights_table(name: str, rows: Sequence[success.Row], cells: Sequence[Cell]) -> str:
     axis = AXES[name]
-    sensors = [sensor for sensor in axis.sensors if sensor not in (BLIND, DEPTH)]
+    sensors = [sensor for sensor in axis.sensors if sensor not in CONTROLS]
     columns = [sensor for sensor in (BLIND, *sensors, DEPTH) if any(sensor in cell.arrived for cell in cells)]
     first, seeds = rows[0], sorted({len(row["seeds"]) for row in rows})
     worlds = first["test_seed"] * first["missions"]

@@ -119,6 +119,8 @@ def test_wires_are_flown_with_two_cameras_of_which_one_has_four_times_the_pixels
     width, height = coarse.camera.width, coarse.camera.height
     same = dataclasses.replace(fine, camera=dataclasses.replace(fine.camera, width=width, height=height))
     assert same == coarse and coarse.camera.mount == "body" and coarse.env.speed_m_s == 8
+    places = places_of(axis, axis.worlds, list(axis.trained), ["blind", "depth"])
+    assert [place.sensor for place in places] == ["blind", "depth", "depth"]  # pixels are nothing to who sees nothing
 
 
 def test_trunks_of_wires_keep_apart_and_wires_hang_level_between_floor_and_ceiling() -> None:
