@@ -63,7 +63,7 @@ typedef struct {
   const float *plane_position, *plane_normal, *plane_albedo;
   int patterned; /* whether shapes have surfaces of their own */
   const float *box_surface, *cylinder_surface, *sphere_surface, *plane_surface; /* [SURFACE_NUMBERS] a shape */
-  int fields;                                                                   /* which `fields.h` draws */
+  int fields; /* which `fields.h` draws */
   const float *field_position, *field_surface;
 } Shapes;
 
@@ -279,8 +279,7 @@ FN int upright(const Camera* c, const Shapes* s, const Eye* e, int n, Upright* f
   return n < s->boxes ? upright_box(c, s, e, n, found) : upright_cylinder(c, s, e, n - s->boxes, found);
 }
 
-/* Writes what the columns at `u` need of an upright shape (`coverage.column_sides`): NUMBERS numbers, `stride` apart.
- */
+/* Writes what the columns at `u` need of an upright shape (`coverage.column_sides`): NUMBERS numbers, `stride` apart. */
 FN void sides(const Camera* c, const Eye* e, const Upright* from, Lanes u, float* numbers, int stride) {
   if (from->is_box)
     box_sides(c, from, u, numbers, stride);
@@ -399,25 +398,23 @@ typedef struct {
 
 #define MEETINGS (DEPTH_OF_LAYERS + 1) /* with layers, and with what is behind them */
 
-/* The texture's factor on LANES rows, at heights `high`, of a column where they meet a surface. */
-FN Lanes texture(const Camera* c, const Wave* waves, const float* ahead, Lanes high, const Meeting* at) {
-  Lanes sum = lanes(0);
+/* Writes the texture's factor on LANES rows, at heights `high`, of a column at those meetings whose bit of `wanted` is
+ * set. */
+FN void textures(const Camera* c, const Wave* waves, const float* ahead, Lanes high, const Meeting* at,
+                 unsigned wanted, Lanes* factor) {
+  UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] = lanes(0);
   for (int i = 0; i < c->waves; ++i) {
-    const Wave* w = &waves[i];
-    const Lanes along = dot3(w->k, ahead) + w->per_high * high;
-    const Lanes phase = w->at_origin + at->depth * along, f = phase - nearest_whole(phase);
-    const Lanes left =
-        box_filter(at->depth * w->right + at->right * along) * box_filter(at->depth * w->up + at->up * along);
-    sum += w->weight * left * (f * (8.0f - 16.0f * absolute(f)));
+    const Wave w = waves[i];
+    const Lanes along = dot3(w.k, ahead) + w.per_high * high;
+    UNROLLED for (int k = 0; k < MEETINGS; ++k) {
+      if (!(wanted >> k & 1)) continue;
+      const Lanes phase = w.at_origin + at[k].depth * along, f = phase - nearest_whole(phase);
+      const Lanes left =
+          box_filter(at[k].depth * w.right + at[k].right * along) * box_filter(at[k].depth * w.up + at[k].up * along);
+      factor[k] += w.weight * left * (f * (8.0f - 16.0f * absolute(f)));
+    }
   }
-  return 1.0f + c->contrast * sum;
-}
-
-/* Writes it for those meetings whose bit of `wanted` is set. */
-FN void textures(const Camera* c, const Wave* waves, const float* ahead, Lanes high, const Meeting* at, unsigned wanted,
-                 Lanes* factor) {
-  UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] =
-      wanted >> k & 1 ? texture(c, waves, ahead, high, &at[k]) : lanes(1);
+  UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] = 1.0f + c->contrast * factor[k];
 }
 
 /* ------------------------------------------------------------------------------------------------------- surfaces */
@@ -516,8 +513,8 @@ FN void surfaces(const Camera* c, const Shapes* s, const Eye* e, Pattern* known,
 }
 
 /* Blends the layers of LANES rows over planes and the sky. `casters`: what casts shadows, or null. */
-FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves, Pattern* known,
-               const Caster* casters, const float* ahead, Lanes high, const Layers* layers) {
+FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves,
+               Pattern* known, const Caster* casters, const float* ahead, Lanes high, const Layers* layers) {
   const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
   int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) if (k < used && !hidden)
@@ -551,8 +548,8 @@ FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye*
     const Layer* layer = &layers->layer[k];
     value[k] = k < visible ? layer->value : lanes(0);
     if (k < visible && c->shadows)
-      value[k] = shaded(c, s, e, casters, ahead, high, at[k].depth, pick(layer->closeness > 0, layer->shape, lanes(-1)),
-                        layer->coverage, value[k]);
+      value[k] = shaded(c, s, e, casters, ahead, high, at[k].depth,
+                        pick(layer->closeness > 0, layer->shape, lanes(-1)), layer->coverage, value[k]);
   }
   if (c->shadows && wanted >> DEPTH_OF_LAYERS & 1) {
     const float others = (float)(s->boxes + s->cylinders + s->spheres);
@@ -709,15 +706,14 @@ FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, E
     e->up[i] = c->tilted ? r[3 * i + 2] : up[i];
   }
   e->is_finite = 1;
-  UNROLLED for (int i = 0; i < 3; ++i) e->is_finite &=
-      is_finite(e->origin[i]) & is_finite(e->forward[i]) & is_finite(e->right[i]) & is_finite(e->up[i]);
+  UNROLLED for (int i = 0; i < 3; ++i)
+    e->is_finite &= is_finite(e->origin[i]) & is_finite(e->forward[i]) & is_finite(e->right[i]) & is_finite(e->up[i]);
 }
 
 /* Number of operands of pictures, or of depth images, which end before LIGHT. */
 static inline int operands_of(int weighted) { return weighted ? OPERANDS : LIGHT; }
 
-/* Reads a call of XLA's into a batch; returns an error for XLA to raise, or 0. `more`: operands that the caller reads.
- */
+/* Reads a call of XLA's into a batch; returns an error for XLA to raise, or 0. `more`: operands that the caller reads. */
 static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, int more, Batch* b) {
   const int operands = operands_of(weighted);
   if (call->args.size != operands + more || call->rets.size != 1)
