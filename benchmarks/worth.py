@@ -28,7 +28,7 @@ memory, and two controls: `blind`, which sees nothing, and `depth`, the truth. T
 A row is written when it is done, with the policies, and is not measured again; no row is begun that would not end in
 time. Several processes may be given the same command, one a GPU: each takes rows that no other has. Arguments after --
 are options of train.py; defaults are those of the hardware. --test-seed 46 is the final split, test worlds 46,000 to
-46,999 for 1,000 missions: it was drawn once, for this map, and nothing is to be chosen by it. Intervals are a bootstrap
+46,999 for 1,000 missions: it was drawn once, for this map, and nothing may be chosen by it. Intervals are a bootstrap
 over seeds and missions, 95 %, differences are of the same missions.
 """
 

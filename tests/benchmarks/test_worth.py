@@ -142,6 +142,19 @@ def test_trunks_of_wires_keep_apart_and_wires_hang_level_between_floor_and_ceili
     assert bool(jnp.all(jnp.where(standing, tops, own.WIRES_M[2]) == own.WIRES_M[2]))
 
 
+def test_who_sees_nothing_stands_beside_both_cameras_and_true_depth_beside_its_own_alone() -> None:
+    axis = AXES["fine"]
+    coarse, fine = axis.trained
+    first, all_flown = dict.fromkeys(list(axis.flown)[:1], 0.25), dict.fromkeys(axis.flown, 0.75)
+    at = {"axis": "fine", "world": "wires"}
+    rows = [row(control, 0, first, **at, trained=coarse) for control in ("blind", "depth")]
+    rows += [row("events", 0, all_flown, **at, trained=camera) for camera in (coarse, fine)]
+    beside = {(cell.trained, cell.flown): set(cell.arrived) for cell in table.cells_of(rows, axis)}
+    assert beside == {(coarse, lux): {"blind", "depth", "events"} for lux in axis.flown} | {
+        (fine, lux): {"blind", "events"} for lux in axis.flown
+    }
+
+
 def test_cameras_of_one_size_average_equally_many_pixels() -> None:
     axis, usual = AXES["size"], config_of(AXES["dark"], Place("medium", "8 m/s", "frames"), SMALL)
     events, frames = (config_of(axis, Place("medium", "8 m/s", sensor), SMALL) for sensor in ("events", "frames"))
