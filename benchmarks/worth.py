@@ -13,8 +13,9 @@ memory, and two controls: `blind`, which sees nothing, and `depth`, the truth. T
     size    as dark, of cameras of one size: a pixel is the mean of 117 real ones, events have a real threshold of 0.2;
             controls are those of dark in the same folder
     shade   sensors as in dark, in the sun; what it does not reach is a hundred times darker; trained without and with
-            cast shadows, flown in both; rooms have ceilings, so that with shadows all of them is in the shade; flown
-            without the sun's shading in full light, and in a hundredth of the light with it, too
+            cast shadows, flown in both; rooms have ceilings, so that with shadows all of them is in the shade; of the
+            rooms of courtyards half have no roof, so that there are lit and dark ones; flown without the sun's shading
+            in full light, and in a hundredth of the light with it, too
     turning the camera on the body, 64 x 48 pixels, at 8 and 12 m/s among trunks, in 50 to 500 lux
     fine    as turning, at 8 m/s among thin trunks and wires, with 64 x 48 and with 128 x 96 pixels; true depth is that
             of a ray through each pixel's middle, which passes by what is thinner than a pixel

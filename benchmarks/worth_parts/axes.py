@@ -145,7 +145,7 @@ AXES: dict[str, Axis] = {
     "size": dataclasses.replace(DARK, question="Light and speed, cameras of one size", sensors=MEAN, controls="dark"),
     "shade": Axis(
         "Sun and shade a hundred times darker",
-        ("medium", "rooms"),
+        ("medium", "rooms", "courtyards"),
         {name: ("--camera.shadows",) if cast else () for name, cast in SHADOWS.items()},
         REAL,
         {name: {"camera": {"shadows": cast}} for name, cast in SHADOWS.items()} | IN_LIGHT,

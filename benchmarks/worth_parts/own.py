@@ -1,7 +1,8 @@
-"""What the axes see and fly beside what the package has: two sensors, worlds with nothing but balls, and with wires."""
+"""What the axes see and fly beside what the package has: two sensors, and worlds of balls, of wires, of courtyards."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -13,10 +14,10 @@ from edqn_jax.config import Config
 from edqn_jax.config.registry import FAMILIES, SENSORS
 from edqn_jax.keys import uniform_parts
 from edqn_jax.sim.physics.drone import Flight
-from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.scene.scene import Scene, UprightBoxes
 from edqn_jax.sim.sensors.built_in import CHANGE_SCALE
 from edqn_jax.sim.sensors.sensor import Image, last_view, nearness_image
-from edqn_jax.sim.worlds import building, discs
+from edqn_jax.sim.worlds import building, discs, rooms
 from edqn_jax.sim.worlds.free_points import TRIES
 
 MOST_LATE = 3
@@ -31,6 +32,9 @@ TRUNKS, TRUNK_RADIUS, TRUNK_GAP = 48, (0.04, 0.12), 2.0
 """Trunks if all find a place, their radii and the free metres between any two, at least."""
 WIRES, WIRE_LENGTH, WIRE_RADIUS, WIRE_HEIGHT = 40, (6.0, 14.0), (0.015, 0.04), (0.8, 8.2)
 """Wires: how many, how long, half as wide as, and how high, metres. They are level, and square in section."""
+
+ROOFED, ROOF_M = 0.5, 0.3
+"""Share of the rooms of `courtyards` that have a roof, and how thick that is, metres."""
 
 
 def difference() -> edqn_jax.Sensor:
@@ -115,11 +119,35 @@ def sample_wires(key: Array) -> Scene:
     )
 
 
+def sample_courtyards(key: Array) -> Scene:
+    """Returns the rooms of this key, of which some have no roof, so that sun reaches them; the key is consumed.
+
+    Where shadows are cast, rooms with a roof are dark but for what shines in through doors and windows.
+    """
+    scene = rooms.sample_rooms(key)
+    height, (along_x, along_y) = rooms.lay_out(key)
+    count = rooms.ROOMS**2
+    low, high = (
+        jnp.column_stack([*(side.ravel() for side in jnp.meshgrid(*sides)), jnp.full(count, level)])
+        for sides, level in (((along_x[:-1], along_y[:-1]), height), ((along_x[1:], along_y[1:]), height + ROOF_M))
+    )
+    roofed = jax.random.uniform(jax.random.fold_in(key, 0), (count,)) < ROOFED
+    albedo = jnp.broadcast_to(scene.planes.albedo[1], (count, 3))
+    roofs = building.make_boxes(roofed, (low + high) / 2, (high - low) / 2, jnp.zeros(count), albedo)
+    boxes: UprightBoxes = jax.tree.map(lambda *parts: jnp.concatenate(parts), scene.boxes, roofs)
+    ground = jax.tree.map(lambda leaf: leaf[:1], scene.planes)
+    return dataclasses.replace(scene, boxes=boxes, planes=ground)
+
+
 def register() -> None:
     """Registers these sensors and worlds, once."""
     if "court" in FAMILIES:
         return
     FAMILIES.register("wires", edqn_jax.Family(sample_wires, WIRES_M, detours=True), "thin trunks, and wires across")
+    size = (rooms.SIDE, rooms.SIDE, rooms.HEIGHT[1])
+    FAMILIES.register(
+        "courtyards", edqn_jax.Family(sample_courtyards, size, detours=True), "rooms, some without a roof"
+    )
     FAMILIES.register("court", edqn_jax.Family(sample_court, COURT_M, edge_m=None), "nothing but balls that are thrown")
     SENSORS.register("frame-difference", difference(), "how the brightness has changed between two frames")
     for count in range(1, MOST_LATE + 1):

@@ -26,6 +26,7 @@ from edqn_jax.sim.sensors.built_in import CHANGE_SCALE
 from edqn_jax.sim.sensors.sensor import nearness_image
 from edqn_jax.sim.task.env import scene_of
 from edqn_jax.sim.task.flights import Record
+from edqn_jax.sim.worlds import rooms
 from tests.support.benchmarks.untrained_runs import SMALL, untrained
 from tests.support.policies import CONFIG
 from tests.support.registries import keep_as_they_are
@@ -140,6 +141,28 @@ def test_trunks_of_wires_keep_apart_and_wires_hang_level_between_floor_and_ceili
     assert float(jnp.where(pairs, apart, jnp.inf).min()) >= own.TRUNK_GAP - 1e-4  # in float32, of 40 m
     tops = trunks.position[..., 2] + trunks.half_height
     assert bool(jnp.all(jnp.where(standing, tops, own.WIRES_M[2]) == own.WIRES_M[2]))
+
+
+def test_courtyards_are_the_rooms_of_the_same_key_of_which_half_have_a_roof_in_place_of_the_ceiling() -> None:
+    keys = jax.random.split(jax.random.key(0), 16)
+    yards, houses = jax.vmap(own.sample_courtyards)(keys), jax.vmap(rooms.sample_rooms)(keys)
+    walls = houses.boxes.yaw.shape[1]
+    np.testing.assert_array_equal(yards.boxes.position[:, :walls], houses.boxes.position)
+    np.testing.assert_array_equal(yards.start, houses.start)
+    assert yards.planes.normal.shape == (16, 1, 3) and bool(jnp.all(yards.planes.normal[..., 2] == 1))
+    at, half = np.asarray(yards.boxes.position[:, walls:]), np.asarray(yards.boxes.half[:, walls:])
+    there = half[..., 0] > 0
+    assert 0.3 < there.mean() < 0.7
+    low, high = at - half, at + half
+    np.testing.assert_allclose(
+        np.where(there, low[..., 2], 0), np.where(there, yards.volume[:, None, 1, 2], 0), atol=1e-5
+    )
+    # The roofs of a world do not overlap: together they are as large as what they cover.
+    grid = np.stack(np.meshgrid(*2 * [np.arange(0.5, rooms.SIDE)]), axis=-1).reshape(-1, 1, 2)
+    covering = ((grid > low[:, None, :, :2]) & (grid < high[:, None, :, :2])).all(axis=-1).sum(axis=-1)
+    assert covering.max() == 1
+    areas = np.where(there, 4 * half[..., 0] * half[..., 1], 0).sum(axis=1)
+    np.testing.assert_allclose(areas, covering.sum(axis=1), rtol=0.1)  # of a grid of 1 m
 
 
 def test_who_sees_nothing_stands_beside_both_cameras_and_true_depth_beside_its_own_alone() -> None:

@@ -54,8 +54,10 @@ FN Caster caster_of(const Shapes* s, const Across* a, int n) {
   return found;
 }
 
-/* The distance towards the sun at which LANES points enter shape `n`, less than 0 where they do not. */
-FN Lanes enters(const Camera* c, const Shapes* s, const Caster* k, int n, Lanes x, Lanes y, Lanes z) {
+/* The distance towards the sun at which LANES points of shapes of these numbers leave shape `n`, at which they enter it
+ * if they are its own; less than 0 where they do not. */
+FN Lanes meets(const Camera* c, const Shapes* s, const Caster* k, int n, Lanes shape, Lanes x, Lanes y, Lanes z) {
+  const Mask itself = shape == (float)n;
   const float* sun = c->sun;
   if (n < s->boxes) {
     const float *at = s->box_position + 3 * n, *half = s->box_half + 3 * n, cos = k->turn.cos, sin = k->turn.sin;
@@ -64,7 +66,7 @@ FN Lanes enters(const Camera* c, const Shapes* s, const Caster* k, int n, Lanes 
     const float pz = inverse(sun[2]), rx = half[0] * fabsf(px), ry = half[1] * fabsf(py), rz = half[2] * fabsf(pz);
     const Lanes mx = (cos * dx + sin * dy) * -px, my = (cos * dy - sin * dx) * -py, mz = dz * -pz;
     const Lanes enter = greater(greater(mx - rx, my - ry), mz - rz), leave = lesser(lesser(mx + rx, my + ry), mz + rz);
-    return pick(enter < leave, enter, lanes(-1));
+    return pick(enter < leave, pick(itself, enter, leave), lanes(-1));
   }
   if (n < s->boxes + s->cylinders) {
     const int i = n - s->boxes;
@@ -75,7 +77,7 @@ FN Lanes enters(const Camera* c, const Shapes* s, const Caster* k, int n, Lanes 
     const Lanes qx = dx + middle * sun[0], qy = dy + middle * sun[1], inside = radius * radius - (qx * qx + qy * qy);
     const Lanes reach = roots(greater(inside, lanes(0)) * (1 / flat)), mz = (z - at[2]) * -pz;
     const Lanes enter = greater(middle - reach, mz - half), leave = lesser(middle + reach, mz + half);
-    return pick((inside > 0) & (enter < leave), enter, lanes(-1));
+    return pick((inside > 0) & (enter < leave), pick(itself, enter, leave), lanes(-1));
   }
   const int i = n - s->boxes - s->cylinders;
   const float *at = s->sphere_position + 3 * i, radius = s->sphere_radius[i], a = dot3(sun, sun);
@@ -83,18 +85,20 @@ FN Lanes enters(const Camera* c, const Shapes* s, const Caster* k, int n, Lanes 
   const Lanes middle = (dx * sun[0] + dy * sun[1] + dz * sun[2]) * (-1 / a);
   const Lanes qx = dx + middle * sun[0], qy = dy + middle * sun[1], qz = dz + middle * sun[2];
   const Lanes miss2 = qx * qx + qy * qy + qz * qz;
-  return pick(roots(miss2) < radius, middle - roots(greater(radius * radius - miss2, lanes(0)) * (1 / a)), lanes(-1));
+  const Lanes reach = roots(greater(radius * radius - miss2, lanes(0)) * (1 / a));
+  return pick(roots(miss2) < radius, pick(itself, middle - reach, middle + reach), lanes(-1));
 }
 
-/* Whether the sun does not reach LANES points. What casts shadows is computed here where `casters` is null. */
-FN Mask in_shadow(const Camera* c, const Shapes* s, const Caster* casters, Lanes x, Lanes y, Lanes z) {
+/* Whether the sun does not reach LANES points of shapes of these numbers. What casts shadows is computed here where
+ * `casters` is null. */
+FN Mask in_shadow(const Camera* c, const Shapes* s, const Caster* casters, Lanes shape, Lanes x, Lanes y, Lanes z) {
   const Across a = across_sun(c);
   const Lanes px = a.level[0] * x + a.level[1] * y, py = a.up[0] * x + a.up[1] * y + a.up[2] * z;
   Lanes dark = lanes(0);
   for (int n = 0; n < s->boxes + s->cylinders + s->spheres; ++n) {
     const Caster k = casters ? casters[n] : caster_of(s, &a, n);
     if (!any_of((absolute(px - k.x) < k.half_x) & (absolute(py - k.y) < k.half_y))) continue;
-    dark = pick(enters(c, s, &k, n, x, y, z) > CLEAR_M, lanes(1), dark);
+    dark = pick(meets(c, s, &k, n, shape, x, y, z) > CLEAR_M, lanes(1), dark);
   }
   for (int n = 0; n < s->planes; ++n) {
     const float *normal = s->plane_normal + 3 * n, *at = s->plane_position + 3 * n, approach = dot3(normal, c->sun);
@@ -127,7 +131,7 @@ FN Lanes shaded(const Camera* c, const Shapes* s, const Eye* e, const Caster* ca
   const Lanes x = e->origin[0] + depth * (ahead[0] + e->up[0] * high);
   const Lanes y = e->origin[1] + depth * (ahead[1] + e->up[1] * high);
   const Lanes z = e->origin[2] + depth * (ahead[2] + e->up[2] * high);
-  const Mask dark = in_shadow(c, s, casters, x, y, z) & (shape >= 0);
+  const Mask dark = in_shadow(c, s, casters, shape, x, y, z) & (shape >= 0);
   if (!any_of(dark)) return value;
   return pick(dark, coverage * ambient_of(c, s, e, pick(dark, shape, lanes(-1))), value);
 }

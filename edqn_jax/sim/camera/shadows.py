@@ -1,7 +1,9 @@
 """Cast shadows: what the sun does not reach, because a shape is in the way, has the ambient light alone.
 
 From the point that a layer shows in a pixel's middle one ray goes towards the sun. So edges of shadows are whole
-pixels, where silhouettes are shares of a pixel (`coverage.py`).
+pixels, where silhouettes are shares of a pixel (`coverage.py`). Where shapes touch, that point may lie within another
+one than it is shown of. So a shape casts a shadow on what is before the place where the ray leaves it, and on itself
+alone where the ray enters it: else the sun would shine along the foot of a wall in the dark.
 
 K layers of H x W pixels, N shapes of a kind.
 """
@@ -18,7 +20,6 @@ from jax import Array, lax
 from edqn_jax.config import SHAPES
 from edqn_jax.sim.camera.raycast import Rays, Values, first_numbers
 from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.sim.scene.shapes.kind import Vector
 from edqn_jax.sim.scene.surface import Daylight
 
 CLEAR_M = 0.01
@@ -32,7 +33,9 @@ def ambient_of(light: Daylight, value: Values, shape: Array) -> Array:
     return light.ambient * albedo.at[shape.astype(jnp.int32)].get(mode="clip")
 
 
-def in_shadow(scene: Scene, light: Daylight, origin: Array, rays: Rays, depth: Array) -> Array:
+def in_shadow(
+    scene: Scene, light: Daylight, origin: Array, rays: Rays, depth: Array, shape: Array, first: dict[str, int]
+) -> Array:
     """Returns which points the sun does not reach: bool [K, H, W].
 
     Args:
@@ -40,19 +43,38 @@ def in_shadow(scene: Scene, light: Daylight, origin: Array, rays: Rays, depth: A
         origin: [3] metres.
         rays: through the middles of pixels.
         depth: [K, H, W] metres along the rays, finite.
+        shape: [K, H, W] number of the shape that is shown.
+        first: number of the first shape of each kind (`raycast.first_numbers`).
     """
     points = jnp.stack([origin[i] + depth * part for i, part in enumerate((rays.dx, rays.dy, rays.dz))], axis=-1)
-    sun: Any = tuple(jnp.reshape(jnp.asarray(light.sun)[i], (1, 1, 1)) for i in range(3))
-    dark = jnp.zeros(depth.size, bool)
+    sun = jnp.asarray(light.sun)
+    points, shown, dark = points.reshape(-1, 3), shape.ravel().astype(jnp.int32), jnp.zeros(depth.size, bool)
     for kind, shapes in scene.shapes().items():
-        if shapes.position.shape[0]:
+        if count := shapes.position.shape[0]:
             # One shape after another: a reduction over shapes takes several times as long on a CPU.
-            dark = lax.scan(partial(_with_one_more, kind, sun, points.reshape(-1, 3)), dark, shapes)[0]
+            numbered = first[kind] + jnp.arange(count), shapes
+            dark = lax.scan(partial(_with_one_more, kind, sun, points, shown), dark, numbered)[0]
     return dark.reshape(depth.shape)
 
 
-def _with_one_more(kind: str, sun: Vector, points: Array, dark: Array, shape: Any) -> tuple[Array, None]:
-    """Returns which points [P, 3] are in the dark [P], with one more shape."""
+def _with_one_more(
+    kind: str, sun: Array, points: Array, shown: Array, dark: Array, numbered: tuple[Array, Any]
+) -> tuple[Array, None]:
+    """Returns which points [P, 3] of shapes `shown` [P] are in the dark [P], with one more shape and its number."""
+    number, shape = numbered
+    known = SHAPES.get(kind)
     alone = jax.tree.map(lambda leaf: leaf[None], shape)
-    met = jax.vmap(lambda point: SHAPES.get(kind).meet(alone, point, sun))(points)
-    return dark | (met.hit & (met.depth > CLEAR_M))[:, 0, 0, 0], None
+
+    def meet(point: Array, way: Array) -> tuple[Array, Array]:
+        met = known.meet(alone, point, tuple(part.reshape(1, 1, 1) for part in way))  # type: ignore[arg-type]
+        return met.hit.reshape(()), met.depth.reshape(())
+
+    if known.reach is None:
+        hit, depth = jax.vmap(meet, (0, None))(points, sun)
+        return dark | (hit & (depth > CLEAR_M)), None
+    # A ray leaves a shape where one that comes back from beyond it enters.
+    beyond = jnp.linalg.norm(points - shape.position, axis=1) + jnp.linalg.norm(known.reach(shape)) + CLEAR_M
+    itself = shown == number
+    begin = jnp.where(itself, 0.0, beyond)
+    hit, depth = jax.vmap(meet)(points + begin[:, None] * sun, jnp.where(itself[:, None], sun, -sun))
+    return dark | (hit & jnp.where(itself, depth > CLEAR_M, depth < beyond - CLEAR_M)), None

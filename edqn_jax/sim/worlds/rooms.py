@@ -45,14 +45,8 @@ def sample_rooms(key: Array) -> Scene:
         key: consumed.
     """
     shapes = _WALLS * _PIECES + 4
-    lines, colours = 2 * (ROOMS - 1), (_WALLS + 5) * building.COLOUR_DRAWS
-    counts = (1 + lines, _WALLS * _OF_A_WALL, colours, 2 * TRIES * 3)
-    plan, walls, shades, ends = uniform_parts(key, counts)
-    height = building.scale_uniforms(HEIGHT, plan[0])
-    even = SIDE / ROOMS * jnp.arange(1, ROOMS)[None]
-    # Along x and along y: [2, ROOMS + 1] metres, where walls stand, outer ones included.
-    stands = even + SHIFT * (2.0 * plan[1:].reshape(2, ROOMS - 1) - 1.0)
-    stands = jnp.concatenate([jnp.zeros((2, 1)), stands, jnp.full((2, 1), SIDE)], axis=1)
+    plan, walls, shades, ends = _uniforms(key)
+    height, stands = _lay_out(plan)
 
     # Walls across x come first, then walls across y: where each stands, and from where to where it runs.
     across = jnp.repeat(stands[:, 1:-1], ROOMS, axis=1).reshape(_WALLS)
@@ -77,6 +71,29 @@ def sample_rooms(key: Array) -> Scene:
         building.floor_and_ceiling(height, albedo[-1]),
         building.make_boxes(present, (low + high) / 2, (high - low) / 2, jnp.zeros(shapes), of_walls),
     )
+
+
+def lay_out(key: Array) -> tuple[Array, Array]:
+    """Returns how high the rooms of `sample_rooms` of this key are, and where their walls stand.
+
+    Returns:
+        height: [] metres. stands: [2, ROOMS + 1] metres along x and along y, outer walls included.
+    """
+    return _lay_out(_uniforms(key)[0])
+
+
+def _uniforms(key: Array) -> list[Array]:
+    """Returns the draws of a world: of its plan, walls, colours, start and goal."""
+    lines, colours = 2 * (ROOMS - 1), (_WALLS + 5) * building.COLOUR_DRAWS
+    return uniform_parts(key, (1 + lines, _WALLS * _OF_A_WALL, colours, 2 * TRIES * 3))
+
+
+def _lay_out(uniforms: Array) -> tuple[Array, Array]:
+    """Returns what `lay_out` does, from the draws of a plan."""
+    even = SIDE / ROOMS * jnp.arange(1, ROOMS)[None]
+    stands = even + SHIFT * (2.0 * uniforms[1:].reshape(2, ROOMS - 1) - 1.0)
+    stands = jnp.concatenate([jnp.zeros((2, 1)), stands, jnp.full((2, 1), SIDE)], axis=1)
+    return building.scale_uniforms(HEIGHT, uniforms[0]), stands
 
 
 def _openings(uniforms: Array, begin: Array, end: Array, height: Array) -> Array:
