@@ -23,8 +23,9 @@ GOAL = "1"
 LATE = "depth-late"
 """Begins the names of true depth that is old."""
 
-ALIKE = {"decisions": "decisions", "missions": "missions", "test_seed": "test worlds"}
-"""By key of a row, in words: what rows that are compared have alike, beside their learner."""
+ALIKE = {"missions": "missions", "test_seed": "test worlds"}
+"""By key of a row, in words: what the rows of an axis have alike, beside their learner; those of a world are of as many
+decisions, too."""
 
 DRAWS = 4000
 """Of the bootstrap of a cell, over seeds and missions; the missions of a draw are the same for all of its sensors."""
@@ -94,6 +95,19 @@ def rows_of(rows: Iterable[success.Row], axis: str) -> list[success.Row]:
     for said, values in alike.items():
         if len(values) > 1:
             raise ConfigError(f"the rows of the axis {axis} have other {said} than each other; move some of them away")
+    for world, lengths in _decisions(found).items():
+        if len(lengths) > 1:
+            raise ConfigError(
+                f"the rows of the axis {axis} in {world} have other decisions than each other; move some of them away"
+            )
+    return found
+
+
+def _decisions(rows: Iterable[success.Row]) -> dict[str, set[int | None]]:
+    """Returns by world for how many decisions a seed was trained; rows of bytes were not."""
+    found: dict[str, set[int | None]] = {}
+    for row in rows:
+        found.setdefault(row["world"], set()).add(row.get("decisions"))
     return found
 
 
@@ -175,7 +189,7 @@ def _flights_table(name: str, rows: Sequence[success.Row], cells: Sequence[Cell]
     worlds = first["test_seed"] * first["missions"]
     lines = [
         f"{axis.question}: {' or '.join(map(str, seeds))} seeds × {first['missions']:,} missions a cell, the same for "
-        f"all sensors (test worlds {worlds} to {worlds + first['missions'] - 1}), {first['decisions']:,} decisions a "
+        f"all sensors (test worlds {worlds} to {worlds + first['missions'] - 1}), {_budgets(rows)} decisions a "
         "seed. Success in % with its 95 % interval; who leads of all but the controls; and by how many points events "
         "are ahead of that sensor of frames which does best in the cell.",
         "",
@@ -189,6 +203,14 @@ def _flights_table(name: str, rows: Sequence[success.Row], cells: Sequence[Cell]
             leads += f" (not flown: {', '.join(cell.missing)})"
         lines.append(f"| {cell.world} | {cell.trained} | {cell.flown} | {shown} | {leads} | {_ahead(cell)} |")
     return "\n".join(lines)
+
+
+def _budgets(rows: Sequence[success.Row]) -> str:
+    """Returns the decisions of a seed, by world where worlds differ."""
+    budgets = {world: f"{count:,}" for world, (count,) in _decisions(rows).items()}
+    if len(set(budgets.values())) == 1:
+        return next(iter(budgets.values()))
+    return ", ".join(f"in {world} {count}" for world, count in budgets.items())
 
 
 def _rate(cell: Cell, sensor: str) -> str:

@@ -405,8 +405,11 @@ def test_the_table_shows_blind_sensors_and_depth_and_refuses_unequal_budgets() -
     assert "| 25.0 (" in wood and "| 50.0 (" in wood
     assert "| events (not flown: frame-pair, frame-difference) | 30.0 (" in wood  # who leads is not said of all
     assert said.count("| medium |") == 6  # no cell of drawn training, of which there are no rows but the controls'
-    with pytest.raises(ConfigError, match="the axis looks have other decisions than each other"):
+    with pytest.raises(ConfigError, match="the axis looks in medium have other decisions than each other"):
         table.all_cells([*rows, row("frame-pair", 0.5, decisions=2000)])
+    longer = [row(sensor, 0.5, world="rooms", decisions=2000) for sensor in ("events", "frames")]
+    said = table.tables([*rows, *longer], table.all_cells([*rows, *longer]))
+    assert "in medium 1,000, in rooms 2,000 decisions a seed" in said
 
 
 def test_an_axis_of_which_controls_alone_were_flown_has_no_table() -> None:
