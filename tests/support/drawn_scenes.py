@@ -92,6 +92,13 @@ def ball(x, y, z, radius):
     return Spheres(position=[x, y, z], radius=radius, albedo=BROWN)
 
 
+def closed_room() -> Scene:
+    """A room of 14 m without an opening: walls that touch each other, the ground and a roof."""
+    places = ((8, 0), (-8, 0), (0, 8), (0, -8))
+    walls = [box(30 + x, 30 + y, 3, 1 + 9 * abs(y) / 8, 1 + 9 * abs(x) / 8, 3) for x, y in places]
+    return scene_of(GROUND, *walls, box(30, 30, 7, 10, 10, 1))
+
+
 @jax.jit
 def clearances(pool, missions, points):
     """Metres [M] from points [M, 3] to the nearest surface in the worlds of M missions."""

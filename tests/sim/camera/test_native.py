@@ -24,7 +24,17 @@ from edqn_jax.sim.scene.scene import PARKED, Scene, stack_scenes, take_scene, wi
 from edqn_jax.sim.scene.shapes import kind, plane
 from edqn_jax.sim.worlds import families
 from tests.support.camera_in_c import CONFIG, ROUNDING, TIES, crowd, frames, in_c
-from tests.support.drawn_scenes import GROUND, ball, box, every_kind, looking, pillar, rotation_of, scene_of
+from tests.support.drawn_scenes import (
+    GROUND,
+    ball,
+    box,
+    closed_room,
+    every_kind,
+    looking,
+    pillar,
+    rotation_of,
+    scene_of,
+)
 from tests.support.marks import in_whole
 
 
@@ -138,6 +148,9 @@ def test_c_draws_shadows_as_jax_does(mount: Literal["level", "body"]) -> None:
         rotation = tilted_poses(rng, 24)
     # Edges of shadows are whole pixels, which rounding may move by one.
     agree(config, scene, origin, rotation, ties=TIES)
+    room = frames([closed_room()], 24, seed=11)[0]
+    within = jnp.asarray(rng.uniform([24, 24, 0.5], [36, 36, 5.5], (24, 3)), jnp.float32)
+    agree(config, room, within, rotation, ties=TIES)  # walls and roof touch
     sunny = drawn(dataclasses.replace(config, shadows=False), scene, origin, rotation)[0]
     assert np.mean(sunny - drawn(config, scene, origin, rotation)[0] > 0.1) > 0.02  # some of it is in the dark
 

@@ -19,7 +19,7 @@ from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import Scene
 from tests.oracles import camera_plain, mujoco_shadows
 from tests.oracles.mujoco_depth import RayCaster
-from tests.support.drawn_scenes import GROUND, box, every_kind, free_points, pillar, rotation_of, scene_of
+from tests.support.drawn_scenes import GROUND, closed_room, every_kind, free_points, pillar, rotation_of, scene_of
 from tests.support.marks import in_whole
 from tests.support.meshes import CUBE, bracket, hull, mesh_world
 
@@ -105,10 +105,7 @@ def test_a_pillar_throws_a_shadow_as_long_as_the_sun_is_low() -> None:
 
 
 def test_no_sun_shines_in_at_the_foot_of_a_wall_or_where_walls_and_roof_meet() -> None:
-    walls = [
-        box(30 + x, 30 + y, 3, 1 + 9 * abs(y) / 8, 1 + 9 * abs(x) / 8, 3) for x, y in ((8, 0), (-8, 0), (0, 8), (0, -8))
-    ]
-    scene = scene_of(GROUND, *walls, box(30, 30, 7, 10, 10, 1))
+    scene = closed_room()
     place = np.array([[28.0, 29.0, 2.5], [32.0, 31.0, 4.0], [30.0, 27.0, 1.0], [29.0, 33.0, 5.0]])
     turn = np.array([rotation_of(0.0, 0.0, yaw) for yaw in (0.3, 1.4, 2.9, 4.1)])
     kept, lit = share_of_sun(CONFIG, scene, place, turn)
