@@ -47,9 +47,6 @@ static inline Lanes roots(Lanes x) {
 }
 
 static inline int any_of(Mask where) {
-#ifdef __AVX__
-  return !_mm256_testz_si256((__m256i)where, (__m256i)where);
-#endif
   const Pairs two = (Pairs)where;
   int64_t found = 0;
   for (int l = 0; l < LANES / 2; ++l) found |= two[l];

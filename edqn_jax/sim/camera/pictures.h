@@ -408,10 +408,9 @@ FN void textures(const Camera* c, const Wave* waves, const float* ahead, Lanes h
     const Lanes along = dot3(w.k, ahead) + w.per_high * high;
     UNROLLED for (int k = 0; k < MEETINGS; ++k) {
       if (!(wanted >> k & 1)) continue;
+      const Lanes phase = w.at_origin + at[k].depth * along, f = phase - nearest_whole(phase);
       const Lanes left =
           box_filter(at[k].depth * w.right + at[k].right * along) * box_filter(at[k].depth * w.up + at[k].up * along);
-      if (!any_of(left > 0)) continue;
-      const Lanes phase = w.at_origin + at[k].depth * along, f = phase - nearest_whole(phase);
       factor[k] += w.weight * left * (f * (8.0f - 16.0f * absolute(f)));
     }
   }

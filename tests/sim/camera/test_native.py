@@ -150,7 +150,8 @@ def test_c_draws_shadows_as_jax_does(mount: Literal["level", "body"]) -> None:
     agree(config, scene, origin, rotation, ties=TIES)
     room = frames([closed_room()], 24, seed=11)[0]
     within = jnp.asarray(rng.uniform([24, 24, 0.5], [36, 36, 5.5], (24, 3)), jnp.float32)
-    agree(config, room, within, rotation, ties=TIES)  # walls and roof touch
+    # Walls and roof touch; a bright shade, so that pictures of it are not empty.
+    agree(dataclasses.replace(config, ambient=0.8), room, within, rotation, ties=TIES)
     sunny = drawn(dataclasses.replace(config, shadows=False), scene, origin, rotation)[0]
     assert np.mean(sunny - drawn(config, scene, origin, rotation)[0] > 0.1) > 0.02  # some of it is in the dark
 
