@@ -2,8 +2,9 @@
 
 From the point that a layer shows in a pixel's middle one ray goes towards the sun. So edges of shadows are whole
 pixels, where silhouettes are shares of a pixel (`coverage.py`). Where shapes touch, that point may lie within another
-one than it is shown of. So a shape casts a shadow on what is before the place where the ray leaves it, and on itself
-alone where the ray enters it: else the sun would shine along the foot of a wall in the dark.
+shape than the one that is shown. So another shape keeps the sun off if the ray leaves it, and the shape that is shown
+only if the ray enters it: else the sun would shine along the foot of a wall in the dark. The price: beside a lit shape
+that another touches, some points are dark that lie within it by the width of a pixel.
 
 K layers of H x W pixels, N shapes of a kind.
 """

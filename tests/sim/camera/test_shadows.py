@@ -14,12 +14,12 @@ import pytest
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim.camera import camera, raycast
+from edqn_jax.sim.camera import camera, raycast, shadows
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import Scene
 from tests.oracles import camera_plain, mujoco_shadows
 from tests.oracles.mujoco_depth import RayCaster
-from tests.support.drawn_scenes import GROUND, closed_room, every_kind, free_points, pillar, rotation_of, scene_of
+from tests.support.drawn_scenes import GROUND, box, closed_room, every_kind, free_points, pillar, rotation_of, scene_of
 from tests.support.marks import in_whole
 from tests.support.meshes import CUBE, bracket, hull, mesh_world
 
@@ -111,3 +111,15 @@ def test_no_sun_shines_in_at_the_foot_of_a_wall_or_where_walls_and_roof_meet() -
     kept, lit = share_of_sun(CONFIG, scene, place, turn)
     # At a grazing angle a pixel of the ground may show in its middle what lies beyond the wall.
     assert lit.sum() > 500 and np.mean(np.abs(kept[lit]) > 0.01) < 2e-3
+
+
+def test_a_shape_shades_what_lies_within_it_but_not_what_stands_on_its_lit_face() -> None:
+    config = dataclasses.replace(CONFIG, width=1, height=1, sun_azimuth_deg=180.0)  # towards -x, where the eye is
+    scene = scene_of(box(30, 28, 2, 1, 1, 2), box(30, 30, 2, 1, 1, 2))  # side by side, their faces at x = 29
+    light = raycast.daylight_of(config, scene.daylight)
+    rays = raycast.camera_rays(config, jnp.eye(3))
+    first = raycast.first_numbers(raycast.albedo_values(scene, jnp.ones(3)))
+    # Metres to points on the second box's face and 5 cm behind it, as shown of the first box (0) and of its own (1).
+    depth, shape = (jnp.array(x, jnp.float32).reshape(-1, 1, 1) for x in ([9, 9.05, 9, 9.05], [0, 0, 1, 1]))
+    dark = shadows.in_shadow(scene, light, jnp.array([20.0, 30.5, 2.0]), rays, depth, shape, first)
+    assert dark.ravel().tolist() == [False, True, False, False]
