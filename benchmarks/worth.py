@@ -12,6 +12,7 @@ memory, and two controls: `blind`, which sees nothing, and `depth`, the truth. T
     dark    light from 0.1 to 10,000 lux, sensors with the faults of real ones
     size    as dark, of cameras of one size: a pixel is the mean of 117 real ones, events have a real threshold of 0.2;
             controls are those of dark in the same folder
+    bandwidth  as size, of events that need a tenth of the light for their bandwidth; frames are those of size
     shade   sensors as in dark, in the sun; what it does not reach is a hundred times darker; trained without and with
             cast shadows, flown in both; rooms have ceilings, so that with shadows all of them is in the shade; of the
             rooms of courtyards half have no roof, so that there are lit and dark ones; flown without the sun's shading

@@ -35,6 +35,8 @@ MEAN_FRAMES = (
 )
 MEAN = {"events": MEAN_EVENTS, "frames": MEAN_FRAMES, "frame-pair": MEAN_FRAMES}
 """Real sensors of one size, whose noise averages out alike: the events' thresholds are a real camera's 0.2."""
+QUICK_PIXEL_LUX = 1.0
+"""Light in which a pixel that needs little of it has the bandwidth that others have at `events.reference_lux`."""
 
 LUX = (0.1, 1.0, 10.0, 100.0, 10_000.0)
 
@@ -85,8 +87,13 @@ class Axis:
     """Controls that see nothing of what differs between conditions of training, and are trained in one."""
     same_flown: bool = False
     """Whether the controls see nothing of what differs between the conditions that are flown."""
-    controls: str | None = None
-    """Another axis, of the same task, whose rows of the controls are this one's, which has none."""
+    borrowed: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """By sensor that the axis does not train: another axis, of the same task, whose rows of it are this one's."""
+
+    @property
+    def shown(self) -> list[str]:
+        """Returns the sensors of a table: the controls, its own, and those of other axes."""
+        return list(dict.fromkeys([*CONTROLS, *self.sensors, *self.borrowed]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +149,18 @@ AXES: dict[str, Axis] = {
         ),
     ),
     "dark": DARK,
-    "size": dataclasses.replace(DARK, question="Light and speed, cameras of one size", sensors=MEAN, controls="dark"),
+    "size": dataclasses.replace(
+        DARK,
+        question="Light and speed, cameras of one size",
+        sensors=MEAN,
+        borrowed=dict.fromkeys(CONTROLS, "dark"),
+    ),
+    "bandwidth": dataclasses.replace(
+        DARK,
+        question="The same, events that need a tenth of the light",
+        sensors={"events": (*MEAN_EVENTS, "--events.reference-lux", str(QUICK_PIXEL_LUX))},
+        borrowed=dict.fromkeys(CONTROLS, "dark") | dict.fromkeys(("frames", "frame-pair"), "size"),
+    ),
     "shade": Axis(
         "Sun and shade a hundred times darker",
         ("medium", "rooms", "courtyards"),

@@ -77,16 +77,16 @@ def rivals_of(sensors: Iterable[str]) -> list[str]:
 
 
 def rows_of(rows: Iterable[success.Row], axis: str) -> list[success.Row]:
-    """Returns the rows of an axis, of those with the same name the newest; where it has rows, with its controls.
+    """Returns the rows of an axis, of those with the same name the newest; where it has rows, with those it borrows.
 
     Raises:
         ConfigError: if they were not trained and flown alike.
     """
-    newest, controls = {}, AXES[axis].controls if axis in AXES else None
+    newest, borrowed = {}, AXES[axis].borrowed if axis in AXES else {}
     known = [row for row in rows if row.get("benchmark") == "worth"]
     own = [row for row in known if row["axis"] == axis]
     if own:
-        own += [row for row in known if row["axis"] == controls and row["sensor"] in CONTROLS]
+        own += [row for row in known if row["axis"] == borrowed.get(row.get("sensor"))]
     for row in own:
         newest[tuple(row.get(key) for key in ("world", "trained", "sensor", "width", "look"))] = row
     found = list(newest.values())
@@ -122,15 +122,16 @@ def cells_of(rows: Sequence[success.Row], axis: Axis) -> list[Cell]:
     first, cells = next(iter(axis.trained)), []
     for world, trained, flown in itertools.product(axis.worlds, axis.trained, axis.flown):
         arrived = {}
-        for sensor in dict.fromkeys([*CONTROLS, *axis.sensors]):
+        for sensor in axis.shown:
             row = of.get((world, first if is_first_alone(axis, sensor) else trained, sensor))
             if row is None:
                 continue
             alike = next(iter(axis.flown)) if len(flown_of(axis, sensor)) == 1 else flown
             if alike in row["flown"]:
                 arrived[sensor] = np.array([[digit == GOAL for digit in seed] for seed in row["flown"][alike]])
-        if arrived.keys() - set(CONTROLS) or len(axis.sensors) == len(arrived):
-            missing = [sensor for sensor in rivals_of(axis.sensors) if sensor not in arrived]
+        own = arrived.keys() & axis.sensors.keys()
+        if own - set(CONTROLS) or len(own) == len(axis.sensors):
+            missing = [sensor for sensor in rivals_of(axis.shown) if sensor not in arrived]
             cells.append(Cell(world, trained, flown, arrived, missing))
     return cells
 
@@ -183,7 +184,7 @@ def tables(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]]) -> 
 
 def _flights_table(name: str, rows: Sequence[success.Row], cells: Sequence[Cell]) -> str:
     axis = AXES[name]
-    sensors = [sensor for sensor in axis.sensors if sensor not in CONTROLS]
+    sensors = [sensor for sensor in axis.shown if sensor not in CONTROLS]
     columns = [sensor for sensor in (BLIND, *sensors, DEPTH) if any(sensor in cell.arrived for cell in cells)]
     first, seeds = rows[0], sorted({len(row["seeds"]) for row in rows})
     worlds = first["test_seed"] * first["missions"]

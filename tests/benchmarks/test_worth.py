@@ -201,6 +201,25 @@ def test_controls_of_another_axis_stand_beside_sensors_that_differ_alone() -> No
     assert "blind" not in axis.sensors and "| medium | 8 m/s | 0.1 lux | 25.0 (" in table.tables(rows, {"size": cells})
 
 
+def test_events_that_need_less_light_stand_beside_the_frames_of_another_axis() -> None:
+    axis, place = AXES["bandwidth"], Place("medium", "8 m/s", "events")
+    usual, quick = (config_of(AXES[name], place, SMALL) for name in ("size", "bandwidth"))
+    assert quick.events.reference_lux == 0.1 * usual.events.reference_lux
+    assert dataclasses.replace(quick, events=usual.events) == usual
+    rates = {"frames": 0.5, "frame-pair": 0.25, "events": 0.75}
+    rows = [
+        row(sensor, rate, dict.fromkeys(axis.flown, rate), axis="size", trained=trained)
+        for sensor, rate in rates.items()
+        for trained in axis.trained
+    ]
+    assert table.cells_of(table.rows_of(rows, "bandwidth"), axis) == []
+    rows.append(row("events", 1.0, dict.fromkeys(axis.flown, 1.0), axis="bandwidth", trained="8 m/s"))
+    cells = table.cells_of(table.rows_of(rows, "bandwidth"), axis)
+    assert [cell.trained for cell in cells] == ["8 m/s"] * len(axis.flown)  # at 4 m/s there are borrowed rows alone
+    assert {sensor: cells[0].arrived[sensor].mean() for sensor in rates} == rates | {"events": 1.0}
+    assert not cells[0].missing
+
+
 def test_learners_stand_in_one_table_with_both_trainings_of_dqn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
