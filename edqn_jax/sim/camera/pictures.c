@@ -21,6 +21,8 @@
 #endif
 #define FN static inline
 #define UNROLLED
+#define MEETINGS_AT_ONCE 1
+#define FILLS_LAYERS 0
 #define ALIGNED
 
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
@@ -47,10 +49,14 @@ static inline Lanes roots(Lanes x) {
 }
 
 static inline int any_of(Mask where) {
+#ifdef __AVX__
+  return _mm256_movemask_ps((__m256)where);
+#else
   const Pairs two = (Pairs)where;
   int64_t found = 0;
   for (int l = 0; l < LANES / 2; ++l) found |= two[l];
   return found != 0;
+#endif
 }
 
 static inline Lanes counted(void) {
@@ -79,7 +85,7 @@ typedef struct {
 
 /* Memory for the frames of one call. */
 typedef struct {
-  float *numbers, *u, *v, *nearest; /* nearest: depths of a column */
+  float *numbers, *u, *v, *columns; /* columns: the image, column by column */
   Sides* sides;
   Extent* spheres;
   Layers* layers;
@@ -100,7 +106,7 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->numbers = malloc(sizeof(float) * ((size_t)uprights * NUMBERS * w->stride + 1));
   w->sides = malloc(sizeof(Sides) * (size_t)(uprights + 1));
   w->layers = aligned_alloc(_Alignof(Layers), sizeof(Layers) * (size_t)(rows / LANES));
-  w->u = malloc(sizeof(float) * (size_t)(w->stride + 2 * rows));
+  w->u = malloc(sizeof(float) * (size_t)(w->stride + rows + c->width * rows));
   w->spheres = malloc(sizeof(Extent) * (size_t)(s->spheres + 1));
   w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + s->fields + 1));
   w->casters = malloc(sizeof(Caster) * (size_t)(uprights + s->spheres + 1));
@@ -112,7 +118,7 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   if (!w->patterns || !w->casters || !w->tilted || !w->heights) return 0;
   if (!prepare_fields(c, rows, s->fields, &w->fields)) return 0;
   w->covering = w->found + c->width;
-  w->v = w->u + w->stride, w->nearest = w->v + rows;
+  w->v = w->u + w->stride, w->columns = w->v + rows;
   /* What lies beyond the image repeats its edge, so that all numbers are finite. */
   for (int i = 0; i < w->stride; ++i) w->u[i] = c->u[i < c->width ? i : c->width - 1];
   for (int i = 0; i < rows; ++i) w->v[i] = c->v[i < c->height ? i : c->height - 1];
@@ -124,14 +130,56 @@ static void release(Work* w) {
   free(w->patterns), free(w->casters), free(w->tilted), free(w->heights), free(w->fields.ray[0]);
 }
 
-/* Writes a column of blended layers. */
-static void finish(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves, Work* w,
-                   const float* ahead, float* column) {
-  for (int b = 0; b < rounded_up(c->height) / LANES; ++b) {
-    const Lanes high = load(w->v + b * LANES);
-    const Lanes behind = blend(c, s, planes, e, waves, w->patterns, w->casters, ahead, high, &w->layers[b]);
-    for (int l = 0; l < LANES && b * LANES + l < c->height; ++l) column[(b * LANES + l) * c->width] = behind[l];
+static float* column_of(const Camera* c, const Work* w, int column) {
+  return w->columns + (size_t)column * rounded_up(c->height);
+}
+
+#ifdef __AVX__
+/* Writes 8 rows of 8 numbers, `width` apart, from 8 columns that are `stride` apart. */
+static inline void turn_block(const float* from, int stride, float* to, int width) {
+  __m256 pairs[8], fours[8];
+  for (int i = 0; i < 8; i += 2) {
+    const __m256 even = _mm256_loadu_ps(from + i * stride), odd = _mm256_loadu_ps(from + (i + 1) * stride);
+    pairs[i] = _mm256_unpacklo_ps(even, odd), pairs[i + 1] = _mm256_unpackhi_ps(even, odd);
   }
+  for (int i = 0; i < 8; i += 4)
+    for (int k = 0; k < 2; ++k) {
+      fours[i + 2 * k] = _mm256_shuffle_ps(pairs[i + k], pairs[i + 2 + k], 0x44);
+      fours[i + 2 * k + 1] = _mm256_shuffle_ps(pairs[i + k], pairs[i + 2 + k], 0xee);
+    }
+  for (int i = 0; i < 4; ++i) {
+    _mm256_storeu_ps(to + i * width, _mm256_permute2f128_ps(fours[i], fours[i + 4], 0x20));
+    _mm256_storeu_ps(to + (i + 4) * width, _mm256_permute2f128_ps(fours[i], fours[i + 4], 0x31));
+  }
+}
+#endif
+
+/* Writes the image [H, C] of the columns. */
+static void write_rows(const Camera* c, const Work* w, float* picture) {
+  const int stride = rounded_up(c->height);
+  int turned = 0; /* rows of whole blocks */
+#ifdef __AVX__
+  if (c->width % 8 == 0)
+    for (; turned + 8 <= c->height; turned += 8)
+      for (int first = 0; first < c->width; first += 8)
+        turn_block(w->columns + first * stride + turned, stride, picture + turned * c->width + first, c->width);
+#endif
+  for (int row = turned; row < c->height; ++row)
+    for (int column = 0; column < c->width; ++column)
+      picture[row * c->width + column] = w->columns[column * stride + row];
+}
+
+/* Writes a column of blended layers. */
+FN INLINED void finish(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves, Work* w,
+                       const float* ahead, float* column) {
+  for (int b = 0; b < rounded_up(c->height) / LANES; ++b)
+    store(column + b * LANES,
+          blend(c, s, planes, e, waves, w->patterns, w->casters, ahead, load(w->v + b * LANES), &w->layers[b]));
+}
+
+/* Whether what is seen within `p` may be in the column at `u`, in rows from height `high` down to `low`. */
+static inline int shows(const Extent* p, float u, float high, float low) {
+  return u >= p->left && u <= p->right && high > p->bottom && low < p->top;
 }
 
 /* Draws one frame of a camera that is fixed to the body, [H, C]. */
@@ -165,15 +213,13 @@ static void draw_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w,
       insert_tilted(c, &w->tilted[n].seen, c->u[column], w->v, w->heights + (size_t)n * of_shape + column, w->stride,
                     w->layers);
     }
-    for (int n = 0; n < s->spheres; ++n) {
-      const Extent* p = &w->spheres[n];
-      if (c->u[column] < p->left || c->u[column] > p->right) continue;
+    for (int n = 0; n < s->spheres; ++n)
       for (int b = 0; b < blocks; ++b)
-        if (w->v[b * LANES] > p->bottom && w->v[b * LANES + LANES - 1] < p->top)
+        if (shows(&w->spheres[n], c->u[column], w->v[b * LANES], w->v[b * LANES + LANES - 1]))
           insert_sphere(c, s, e, n, ahead, load(w->v + b * LANES), &w->layers[b]);
-    }
-    finish(c, s, planes, e, waves, w, ahead, picture + column);
+    finish(c, s, planes, e, waves, w, ahead, column_of(c, w, column));
   }
+  write_rows(c, w, picture);
 }
 
 /* Draws one frame, [H, C]. */
@@ -227,8 +273,9 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
       const float* numbers = w->sides[w->covering[column * w->most + n]].numbers + column;
       for (int b = 0; b < blocks; ++b) insert_side(c, numbers, w->stride, b * LANES, &w->layers[b]);
     }
-    finish(c, s, planes, e, waves, w, ahead, picture + column);
+    finish(c, s, planes, e, waves, w, ahead, column_of(c, w, column));
   }
+  write_rows(c, w, picture);
 }
 
 /* Depth along the middle ray of every pixel of a camera that is fixed to the body, [H, C]. */
@@ -254,7 +301,7 @@ static void measure_tilted(const Camera* c, const Shapes* s, const Eye* e, Work*
     ++visible;
   }
   for (int column = 0; column < c->width; ++column) {
-    float ahead[3], *nearest = w->nearest;
+    float ahead[3], *nearest = column_of(c, w, column);
     ray_ahead(e, c->u[column], ahead);
     for (int row = 0; row < c->height; row += LANES) {
       const Lanes v = load(w->v + row), dx = ahead[0] + e->up[0] * v, dy = ahead[1] + e->up[1] * v;
@@ -270,8 +317,8 @@ static void measure_tilted(const Camera* c, const Shapes* s, const Eye* e, Work*
         store(nearest + row, nearer_tilted(s, e, p, ahead, load(w->v + row), load(nearest + row)));
       }
     }
-    for (int row = 0; row < c->height; ++row) picture[row * c->width + column] = nearest[row];
   }
+  write_rows(c, w, picture);
 }
 
 /* Depth along the middle ray of every pixel of one frame, [H, C]; NOWHERE where there is nothing. */
@@ -282,6 +329,7 @@ static void measure(const Camera* c, const Shapes* s, const Eye* e, Work* w, flo
     measure_tilted(c, s, e, w, planes, picture);
     return;
   }
+  for (int n = 0; n < s->spheres; ++n) w->spheres[n] = extent_of_sphere(c, s, e, n);
   memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     if (upright_out_of_sight(c, s, e, n)) continue;
@@ -302,15 +350,19 @@ static void measure(const Camera* c, const Shapes* s, const Eye* e, Work* w, flo
     const float dx = e->cos + c->u[column] * e->sin, dy = e->sin - c->u[column] * e->cos;
     for (int first = 0; first < c->height; first += LANES) {
       const Lanes dz = load(w->v + first), per_z = inverses(dz);
-      Lanes nearest = nearest_of_others(s, planes, e, lanes(dx), lanes(dy), dz);
+      Lanes nearest = nearest_of_planes(s, planes, lanes(dx), lanes(dy), dz);
+      for (int n = 0; n < s->spheres; ++n)
+        if (shows(&w->spheres[n], c->u[column], w->v[first], w->v[first + LANES - 1]))
+          nearest = nearer_sphere(s, e, n, lanes(dx), lanes(dy), dz, nearest);
       for (int k = 0; k < w->found[column]; ++k) {
         const int n = w->covering[column * w->most + k];
         const float* from = w->numbers + (size_t)n * NUMBERS * w->stride + column;
         nearest = nearer_upright(level_of(s, e, n), lanes(from[0]), lanes(from[w->stride]), per_z, nearest);
       }
-      for (int l = 0; l < LANES && first + l < c->height; ++l) picture[(first + l) * c->width + column] = nearest[l];
+      store(column_of(c, w, column) + first, nearest);
     }
   }
+  write_rows(c, w, picture);
 }
 
 /* ------------------------------------------------------------------------------------------------------- handlers */

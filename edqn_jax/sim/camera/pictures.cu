@@ -15,6 +15,8 @@
 #define LANES 1
 #define FN static __device__ __forceinline__
 #define UNROLLED _Pragma("unroll")
+#define MEETINGS_AT_ONCE MEETINGS
+#define FILLS_LAYERS 1
 #define ALIGNED __align__(16)
 #define COLUMNS 32
 #define ROWS 4

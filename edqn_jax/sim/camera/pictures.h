@@ -6,7 +6,9 @@
  *
  * Whoever includes this has defined: LANES, how many pixels are drawn at a time; Lanes and Mask, their numbers and
  * whether something holds of them; FN, how functions are declared; UNROLLED, before a loop; ALIGNED, of what is read at
- * once; and lanes, store, pick, lesser, greater, absolute, roots, any_of, counted, highest of Lanes.
+ * once; MEETINGS_AT_ONCE, of how many surfaces the texture is worked out in one loop over its waves; FILLS_LAYERS,
+ * whether layers without a shape are filled, so that threads do not part; and lanes, store, pick, lesser, greater,
+ * absolute, roots, any_of, counted, highest of Lanes.
  */
 
 #ifndef EDQN_PICTURES_H
@@ -20,6 +22,9 @@
 #include "handler.h"
 
 #define NOWHERE 1e30f
+/* Of functions whose numbers would otherwise go to their callers through memory, or that GCC would round in another way
+ * in a call of its own. */
+#define INLINED __attribute__((always_inline))
 
 FN Lanes between(Lanes x, float low, float high) { return lesser(greater(x, lanes(low)), lanes(high)); }
 FN Lanes inverses(Lanes x) { return 1.0f / pick(absolute(x) < TINY, lanes(TINY), x); }
@@ -293,7 +298,8 @@ typedef struct {
   Lanes closeness, coverage, value, slope, shape; /* shape: its number, boxes first, then cylinders, then spheres */
 } Layer;
 
-/* The nearest layers of LANES rows of a column, nearest first, and how many shapes were inserted. */
+/* The nearest layers of LANES rows of a column, nearest first, and how many shapes were inserted: where they are fewer
+ * than layers, the others hold nothing, or what is not to be read. */
 typedef struct {
   Layer layer[DEPTH_OF_LAYERS];
   int inserted;
@@ -301,12 +307,17 @@ typedef struct {
 
 FN void insert(Layers* layers, Layer added) {
   const Layer none = {lanes(0), lanes(0), lanes(0), lanes(0), lanes(0)};
-  if (!layers->inserted++) {
+  const int filled = layers->inserted++;
+  if (FILLS_LAYERS && !filled) {
     layers->layer[0] = added;
     for (int k = 1; k < DEPTH_OF_LAYERS; ++k) layers->layer[k] = none;
     return;
   }
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) {
+    if (!FILLS_LAYERS && k == filled) {
+      layers->layer[k] = added;
+      return;
+    }
     const Layer old = layers->layer[k];
     const Mask nearer = added.closeness > old.closeness;
     const Layer front = {pick(nearer, added.closeness, old.closeness), pick(nearer, added.coverage, old.coverage),
@@ -403,15 +414,18 @@ typedef struct {
 FN void textures(const Camera* c, const Wave* waves, const float* ahead, Lanes high, const Meeting* at,
                  unsigned wanted, Lanes* factor) {
   UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] = lanes(0);
-  for (int i = 0; i < c->waves; ++i) {
-    const Wave w = waves[i];
-    const Lanes along = dot3(w.k, ahead) + w.per_high * high;
-    UNROLLED for (int k = 0; k < MEETINGS; ++k) {
-      if (!(wanted >> k & 1)) continue;
-      const Lanes phase = w.at_origin + at[k].depth * along, f = phase - nearest_whole(phase);
-      const Lanes left =
-          box_filter(at[k].depth * w.right + at[k].right * along) * box_filter(at[k].depth * w.up + at[k].up * along);
-      factor[k] += w.weight * left * (f * (8.0f - 16.0f * absolute(f)));
+  UNROLLED for (int from = 0; from < MEETINGS; from += MEETINGS_AT_ONCE) {
+    if (!(wanted >> from & ((1u << MEETINGS_AT_ONCE) - 1))) continue;
+    for (int i = 0; i < c->waves; ++i) {
+      const Wave* w = &waves[i];
+      const Lanes along = dot3(w->k, ahead) + w->per_high * high;
+      UNROLLED for (int k = from; k < from + MEETINGS_AT_ONCE; ++k) {
+        if (!(wanted >> k & 1)) continue;
+        const Lanes phase = w->at_origin + at[k].depth * along, f = phase - nearest_whole(phase);
+        const Lanes left = box_filter(at[k].depth * w->right + at[k].right * along) *
+                           box_filter(at[k].depth * w->up + at[k].up * along);
+        factor[k] += w->weight * left * (f * (8.0f - 16.0f * absolute(f)));
+      }
     }
   }
   UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] = 1.0f + c->contrast * factor[k];
@@ -513,8 +527,8 @@ FN void surfaces(const Camera* c, const Shapes* s, const Eye* e, Pattern* known,
 }
 
 /* Blends the layers of LANES rows over planes and the sky. `casters`: what casts shadows, or null. */
-FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves,
-               Pattern* known, const Caster* casters, const float* ahead, Lanes high, const Layers* layers) {
+FN INLINED Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves,
+                       Pattern* known, const Caster* casters, const float* ahead, Lanes high, const Layers* layers) {
   const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
   int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) if (k < used && !hidden)
@@ -624,8 +638,8 @@ FN int upright_out_of_sight(const Camera* c, const Shapes* s, const Eye* e, int 
   return out_of_sight(c, e, at[0] - e->origin[0], at[1] - e->origin[1], radius);
 }
 
-/* Depths at which LANES rays along (dx, dy, dz) meet a plane or a sphere; else NOWHERE. */
-FN Lanes nearest_of_others(const Shapes* s, const Plane* planes, const Eye* e, Lanes dx, Lanes dy, Lanes dz) {
+/* Depths at which LANES rays along (dx, dy, dz) meet a plane; else NOWHERE. */
+FN Lanes nearest_of_planes(const Shapes* s, const Plane* planes, Lanes dx, Lanes dy, Lanes dz) {
   Lanes nearest = lanes(NOWHERE);
   for (int n = 0; n < s->planes; ++n) {
     const Plane* p = &planes[n];
@@ -633,15 +647,24 @@ FN Lanes nearest_of_others(const Shapes* s, const Plane* planes, const Eye* e, L
     const Lanes approach = ahead + p->normal[2] * dz, t = -p->height * inverses(approach);
     nearest = pick((approach < 0) & (t > 0) & (t < HORIZON_M) & (t < nearest), t, nearest);
   }
-  for (int n = 0; n < s->spheres; ++n) {
-    const float *at = s->sphere_position + 3 * n, radius = s->sphere_radius[n];
-    const float ox = e->origin[0] - at[0], oy = e->origin[1] - at[1], oz = e->origin[2] - at[2];
-    const Lanes a = dx * dx + dy * dy + dz * dz, middle = -(ox * dx + oy * dy + oz * dz) / a;
-    const Lanes px = ox + middle * dx, py = oy + middle * dy, pz = oz + middle * dz;
-    const Lanes miss2 = px * px + py * py + pz * pz;
-    const Lanes t = middle - roots(greater(radius * radius - miss2, lanes(0)) / a);
-    nearest = pick((roots(miss2) < radius) & (t > 0) & (t < nearest), t, nearest);
-  }
+  return nearest;
+}
+
+/* Lowers `nearest` of LANES rays along (dx, dy, dz) to the depth at which they meet sphere `n`. */
+FN Lanes nearer_sphere(const Shapes* s, const Eye* e, int n, Lanes dx, Lanes dy, Lanes dz, Lanes nearest) {
+  const float *at = s->sphere_position + 3 * n, radius = s->sphere_radius[n];
+  const float ox = e->origin[0] - at[0], oy = e->origin[1] - at[1], oz = e->origin[2] - at[2];
+  const Lanes a = dx * dx + dy * dy + dz * dz, middle = -(ox * dx + oy * dy + oz * dz) / a;
+  const Lanes px = ox + middle * dx, py = oy + middle * dy, pz = oz + middle * dz;
+  const Lanes miss2 = px * px + py * py + pz * pz;
+  const Lanes t = middle - roots(greater(radius * radius - miss2, lanes(0)) / a);
+  return pick((roots(miss2) < radius) & (t > 0) & (t < nearest), t, nearest);
+}
+
+/* Depths at which LANES rays along (dx, dy, dz) meet a plane or a sphere; else NOWHERE. */
+FN Lanes nearest_of_others(const Shapes* s, const Plane* planes, const Eye* e, Lanes dx, Lanes dy, Lanes dz) {
+  Lanes nearest = nearest_of_planes(s, planes, dx, dy, dz);
+  for (int n = 0; n < s->spheres; ++n) nearest = nearer_sphere(s, e, n, dx, dy, dz, nearest);
   return nearest;
 }
 

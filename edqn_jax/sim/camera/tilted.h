@@ -9,8 +9,6 @@
 #define EDQN_TILTED_H
 
 #define CUT_M 1e-3f /* nearest depth of what is projected */
-/* Called twice: a call of its own would change how GCC rounds the level camera's pictures, within one file. */
-#define INLINED __attribute__((always_inline))
 #define MOST_CORNERS 8 /* of a rectangle that a plane cuts: 5, or twice 4 of numbers that are not finite */
 
 /* A face of a box in the image, convex. */
