@@ -157,7 +157,7 @@ AXES: dict[str, Axis] = {
     ),
     "bandwidth": dataclasses.replace(
         DARK,
-        question="The same, events that need a tenth of the light",
+        question="Cameras of one size, events that need a tenth of the light",
         sensors={"events": (*MEAN_EVENTS, "--events.reference-lux", str(QUICK_PIXEL_LUX))},
         borrowed=dict.fromkeys(CONTROLS, "dark") | dict.fromkeys(("frames", "frame-pair"), "size"),
     ),

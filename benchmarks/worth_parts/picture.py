@@ -137,11 +137,12 @@ def _flights_panel(name: str, cells: Sequence[Cell]) -> Panel:
 
 
 def _written(cell: Cell, best: Sequence[str]) -> str:
-    """Returns success as blind → best → depth, and by how much the best of the events' camera is ahead or behind."""
+    """Returns success as blind → best → depth, the best and who is level with it, and whether blind is ahead of it."""
     named = [sensor for sensor in (BLIND, *best[:1], DEPTH) if sensor in cell.arrived]
     rates = " → ".join(f"{100 * cell.arrived[sensor].mean():.0f}" for sensor in dict.fromkeys(named))
     tied = f"{len(best)} of {len(cell.rivals)} alike" if len(best) > MOST_NAMED else _named(best)
-    return f"{rates}\n{tied}"
+    blinded = BLIND in cell.arrived and best and cell.lead(BLIND, best[0])[0] > 0
+    return f"{rates}\n{tied}" + ("\nblind is ahead" if blinded else "")
 
 
 def _named(sensors: Sequence[str]) -> str:

@@ -218,6 +218,16 @@ def test_events_that_need_less_light_stand_beside_the_frames_of_another_axis() -
     assert [cell.trained for cell in cells] == ["8 m/s"] * len(axis.flown)  # at 4 m/s there are borrowed rows alone
     assert {sensor: cells[0].arrived[sensor].mean() for sensor in rates} == rates | {"events": 1.0}
     assert not cells[0].missing
+    assert "| frames | frame-pair |" in table.tables(rows, {"bandwidth": cells})
+    without = [each for each in rows if each["sensor"] != "frame-pair"]
+    assert table.cells_of(table.rows_of(without, "bandwidth"), axis)[0].missing == ["frame-pair"]
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_no_axis_trains_what_it_borrows(name: str) -> None:
+    axis = AXES[name]
+    assert not axis.sensors.keys() & axis.borrowed.keys()
+    assert all(sensor in AXES[other].sensors for sensor, other in axis.borrowed.items())
 
 
 def test_learners_stand_in_one_table_with_both_trainings_of_dqn(
@@ -448,6 +458,11 @@ def test_the_map_has_a_panel_for_each_axis_and_says_what_its_colours_are(tmp_pat
     whole = [*rows, row("frame-pair", 0.5), row("frame-difference", 0.5)]
     looks, _ = draw_map(whole, table.all_cells(whole), tmp_path / "whole.png").axes
     assert {patch.get_hatch() for patch in looks.patches} == {None}
+    written = {text.get_text().splitlines()[-1] for text in looks.texts}
+    assert "blind is ahead" not in written
+    ahead = [*whole, row("blind", 0.95)]
+    looks, _ = draw_map(ahead, table.all_cells(ahead), tmp_path / "ahead.png").axes
+    assert {text.get_text().splitlines()[-1] for text in looks.texts} == {"blind is ahead"}
     assert (tmp_path / "map.png").is_file()
     with pytest.raises(ConfigError, match="there are no rows of this benchmark"):
         draw_map([], {}, tmp_path / "none.png")
