@@ -172,9 +172,13 @@ static void write_rows(const Camera* c, const Work* w, float* picture) {
 /* Writes a column of blended layers. */
 FN INLINED void finish(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves, Work* w,
                        const float* ahead, float* column) {
-  for (int b = 0; b < rounded_up(c->height) / LANES; ++b)
+  float phases[MOST_WAVES];
+  for (int i = 0; i < c->waves; ++i) phases[i] = dot3(waves[i].k, ahead);
+  for (int b = 0; b < rounded_up(c->height) / LANES; ++b) {
+    const Lanes high = load(w->v + b * LANES);
     store(column + b * LANES,
-          blend(c, s, planes, e, waves, w->patterns, w->casters, ahead, load(w->v + b * LANES), &w->layers[b]));
+          blend(c, s, planes, e, waves, w->patterns, w->casters, ahead, phases, high, &w->layers[b]));
+  }
 }
 
 /* Whether what is seen within `p` may be in the column at `u`, in rows from height `high` down to `low`. */

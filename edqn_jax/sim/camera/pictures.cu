@@ -219,7 +219,7 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
     kept = uprights <= THREADS && found <= many;
     if (drawn)
       batch.pictures[((int64_t)m * c->height + row) * c->width + column] =
-          blend(c, s, frame.planes, e, waves, 0, 0, ahead, dz, &layers);
+          blend(c, s, frame.planes, e, waves, 0, 0, ahead, 0, dz, &layers);
   }
 }
 
@@ -378,7 +378,7 @@ static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(c
     if (!drawn) continue;
     for (int n = 0; n < s->spheres; ++n) insert_sphere(c, s, e, n, ahead, v, &layers);
     batch.pictures[((int64_t)m * c->height + row) * c->width + column] =
-        blend(c, s, frame.planes, e, waves, 0, 0, ahead, v, &layers);
+        blend(c, s, frame.planes, e, waves, 0, 0, ahead, 0, v, &layers);
   }
 }
 

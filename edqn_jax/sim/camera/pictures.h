@@ -410,15 +410,15 @@ typedef struct {
 #define MEETINGS (DEPTH_OF_LAYERS + 1) /* with layers, and with what is behind them */
 
 /* Writes the texture's factor on LANES rows, at heights `high`, of a column at those meetings whose bit of `wanted` is
- * set. */
-FN void textures(const Camera* c, const Wave* waves, const float* ahead, Lanes high, const Meeting* at,
-                 unsigned wanted, Lanes* factor) {
+ * set. `phases`: of each wave, by how many periods a metre of depth it changes at height 0, or null. */
+FN void textures(const Camera* c, const Wave* waves, const float* ahead, const float* phases, Lanes high,
+                 const Meeting* at, unsigned wanted, Lanes* factor) {
   UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] = lanes(0);
   UNROLLED for (int from = 0; from < MEETINGS; from += MEETINGS_AT_ONCE) {
     if (!(wanted >> from & ((1u << MEETINGS_AT_ONCE) - 1))) continue;
     for (int i = 0; i < c->waves; ++i) {
       const Wave* w = &waves[i];
-      const Lanes along = dot3(w->k, ahead) + w->per_high * high;
+      const Lanes along = (phases ? phases[i] : dot3(w->k, ahead)) + w->per_high * high;
       UNROLLED for (int k = from; k < from + MEETINGS_AT_ONCE; ++k) {
         if (!(wanted >> k & 1)) continue;
         const Lanes phase = w->at_origin + at[k].depth * along, f = phase - nearest_whole(phase);
@@ -526,9 +526,11 @@ FN void surfaces(const Camera* c, const Shapes* s, const Eye* e, Pattern* known,
   }
 }
 
-/* Blends the layers of LANES rows over planes and the sky. `casters`: what casts shadows, or null. */
+/* Blends the layers of LANES rows over planes and the sky. `casters`: what casts shadows, or null; `phases`: as in
+ * `textures`. */
 FN INLINED Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves,
-                       Pattern* known, const Caster* casters, const float* ahead, Lanes high, const Layers* layers) {
+                       Pattern* known, const Caster* casters, const float* ahead, const float* phases, Lanes high,
+                       const Layers* layers) {
   const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
   int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) if (k < used && !hidden)
@@ -555,7 +557,7 @@ FN INLINED Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, co
   if (s->patterned)
     surfaces(c, s, e, known, ahead, high, at, layers, wanted, plane, factor);
   else
-    textures(c, waves, ahead, high, at, wanted, factor);
+    textures(c, waves, ahead, phases, high, at, wanted, factor);
 
   Lanes value[DEPTH_OF_LAYERS];
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) {
