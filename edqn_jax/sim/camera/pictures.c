@@ -33,11 +33,14 @@ typedef int64_t Pairs __attribute__((vector_size(4 * LANES)));
 static inline Lanes lanes(float x) { return x - (Lanes){0}; }
 static inline Lanes load(const float* from) { return *(const Loose*)from; }
 static inline void store(float* to, Lanes x) { *(Loose*)to = x; }
-static inline Lanes pick(Mask where, Lanes a, Lanes b) { return (Lanes)((where & (Mask)a) | (~where & (Mask)b)); }
 #ifdef __AVX__ /* one instruction, which compilers do not find by themselves */
+static inline Lanes pick(Mask where, Lanes a, Lanes b) {
+  return (Lanes)_mm256_blendv_ps((__m256)b, (__m256)a, (__m256)where);
+}
 static inline Lanes lesser(Lanes a, Lanes b) { return (Lanes)_mm256_min_ps((__m256)a, (__m256)b); }
 static inline Lanes greater(Lanes a, Lanes b) { return (Lanes)_mm256_max_ps((__m256)a, (__m256)b); }
 #else
+static inline Lanes pick(Mask where, Lanes a, Lanes b) { return (Lanes)((where & (Mask)a) | (~where & (Mask)b)); }
 static inline Lanes lesser(Lanes a, Lanes b) { return pick(a < b, a, b); }
 static inline Lanes greater(Lanes a, Lanes b) { return pick(a > b, a, b); }
 #endif
