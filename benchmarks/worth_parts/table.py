@@ -86,7 +86,7 @@ def rows_of(rows: Iterable[success.Row], axis: str) -> list[success.Row]:
     known = [row for row in rows if row.get("benchmark") == "worth"]
     own = [row for row in known if row["axis"] == axis]
     if own:
-        own += [row for row in known if row["axis"] == borrowed.get(row.get("sensor"))]
+        own += [row for row in known if row["axis"] == borrowed.get(row.get("sensor", ""))]
     for row in own:
         newest[tuple(row.get(key) for key in ("world", "trained", "sensor", "width", "look"))] = row
     found = list(newest.values())
