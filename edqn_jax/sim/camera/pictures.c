@@ -109,7 +109,7 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->numbers = malloc(sizeof(float) * ((size_t)uprights * NUMBERS * w->stride + 1));
   w->sides = malloc(sizeof(Sides) * (size_t)(uprights + 1));
   w->layers = aligned_alloc(_Alignof(Layers), sizeof(Layers) * (size_t)(rows / LANES));
-  w->u = malloc(sizeof(float) * (size_t)(w->stride + rows + c->width * rows));
+  w->u = malloc(sizeof(float) * ((size_t)w->stride + (size_t)rows + (size_t)c->width * (size_t)rows));
   w->spheres = malloc(sizeof(Extent) * (size_t)(s->spheres + 1));
   w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + s->fields + 1));
   w->casters = malloc(sizeof(Caster) * (size_t)(uprights + s->spheres + 1));

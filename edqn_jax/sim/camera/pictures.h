@@ -6,9 +6,9 @@
  *
  * Whoever includes this has defined: LANES, how many pixels are drawn at a time; Lanes and Mask, their numbers and
  * whether something holds of them; FN, how functions are declared; UNROLLED, before a loop; ALIGNED, of what is read at
- * once; MEETINGS_AT_ONCE, of how many surfaces the texture is worked out in one loop over its waves; FILLS_LAYERS,
- * whether layers without a shape are filled, so that threads do not part; and lanes, store, pick, lesser, greater,
- * absolute, roots, any_of, counted, highest of Lanes.
+ * once; MEETINGS_AT_ONCE, a divisor of MEETINGS, of how many surfaces the texture is worked out in one loop over its
+ * waves; FILLS_LAYERS, whether layers without a shape are filled, so that threads do not part; and lanes, store, pick,
+ * lesser, greater, absolute, roots, any_of, counted, highest of Lanes.
  */
 
 #ifndef EDQN_PICTURES_H
@@ -299,7 +299,7 @@ typedef struct {
 } Layer;
 
 /* The nearest layers of LANES rows of a column, nearest first, and how many shapes were inserted: where they are fewer
- * than layers, the others hold nothing, or what is not to be read. */
+ * than layers, the others hold nothing if FILLS_LAYERS, else what is not to be read. */
 typedef struct {
   Layer layer[DEPTH_OF_LAYERS];
   int inserted;

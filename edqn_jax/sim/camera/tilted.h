@@ -291,7 +291,7 @@ FN void insert_cylinder(const Camera* c, const Seen* p, float u, Lanes high, con
   insert(layers, added);
 }
 
-/* The part of the image, a pixel and a half wider, in which a sphere may be seen. */
+/* The part of the image, a pixel and a half wider, in which a sphere may be seen, if the eye's axes have length 1. */
 FN Extent extent_of_sphere(const Camera* c, const Shapes* s, const Eye* e, int n) {
   const float *at = s->sphere_position + 3 * n, r = s->sphere_radius[n], margin = 1.5f * c->pitch;
   const float to[3] = {at[0] - e->origin[0], at[1] - e->origin[1], at[2] - e->origin[2]};
